@@ -1,4 +1,4 @@
-"""What escapes on a thread of ROS is caught there, and counted on the loop's thread."""
+"""Catches exceptions on the threads of ROS, and counts them as faults on the loop's thread."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ log = logging.getLogger(__name__)
 
 
 class FaultContainment:
-    """What a node calls on its own threads; `entries` are the loop's, or None without one."""
+    """Contains the exceptions of callbacks on a node's own threads.
+
+    `_entries` are those of the event loop, or None without one.
+    """
 
     def __init__(self) -> None:
         self._entries: Entries | None = None
 
     def _contained(self, entry: str, callback: Callable[..., None]) -> Callable[..., None]:
-        """The callback, whose exceptions end nothing else."""
+        """Wrap a callback so that its exceptions end nothing else."""
 
         def run(*args: Any) -> None:
             try:
@@ -32,7 +35,7 @@ class FaultContainment:
     def _tell_fault(self, entry: str, error: Exception) -> None:
         """Count, on the loop's thread, what was caught on this one."""
         entries = self._entries
-        with suppress(RuntimeError):  # the loop is closed: there is nobody to hear it
+        with suppress(RuntimeError):  # the loop is closed: nobody can receive it
             if entries is not None:
                 entries.from_thread("ros.fault", entries.faults.caught, entry, error)
                 return

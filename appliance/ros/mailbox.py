@@ -1,5 +1,6 @@
-"""Where the ROS thread leaves messages for the event loop's thread: bounded, the newest kept, and
-small ones taken before large ones.
+"""A bounded queue of messages from the ROS thread to the event loop's thread.
+
+When it is full the oldest messages are dropped; small messages overtake large ones of other topics.
 """
 
 from __future__ import annotations
@@ -12,37 +13,37 @@ from dataclasses import dataclass, field
 from appliance.broker.message import Message
 from appliance.ros.metrics import FlowCounters
 
-#: The most that waits in all: a loop that was busy for a second with 10 kHz on the bus.
+#: The limits of the whole queue: enough for a loop that is busy for a second at 10 kHz on the bus.
 MAX_MESSAGES = 10_000
 MAX_BYTES = 64 * 1024 * 1024
 
-#: A payload of more bytes is large: an image or a map, not a state or a command.
+#: A payload with more bytes is large: an image or a map, not a state or a command.
 LARGE = 32 * 1024
 
-#: Bytes that are taken in one go, if that is more than one message: a millisecond or two of work.
+#: A batch ends when it has reached so many bytes: a millisecond or two of work.
 TAKEN_BYTES = 1024 * 1024
 
 
 @dataclass(eq=False, slots=True)
 class Lane:
-    """The messages of one topic that wait; of more than `keep` the oldest is dropped.
+    """The queued messages of one topic; if there are more than `depth`, the oldest is dropped.
 
-    `timed` is one of which it is known when it was published, in nanoseconds since the epoch.
+    `timed` is one of them and the time at which it was published, in nanoseconds since the epoch.
     """
 
-    keep: int
+    depth: int
     counters: FlowCounters
     timed: tuple[Message, int] | None = None
     waiting: deque[Message] = field(default_factory=deque)
-    #: Where it waits for its turn, if it does.
+    #: The queue of lanes that it is in, if any.
     queue: deque[Lane] | None = None
 
 
 class Mailbox:
     """Lanes of messages between two threads.
 
-    `wake` is called on the sender's thread when there is something to take and it has not been
-    called since the mailbox was last found empty.
+    `wake` is called on the sender's thread when a message comes, once until the receiver has found
+    the mailbox empty again.
     """
 
     def __init__(
@@ -55,8 +56,8 @@ class Mailbox:
         self._max_messages = max_messages
         self._max_bytes = max_bytes
         self._lock = threading.Lock()
-        #: The lanes with something waiting, the one whose turn it is first: those whose next
-        #: message is small, and those where it is large.
+        #: The lanes with messages, in turn: those whose next message is small, and those whose next
+        #: message is large.
         self._small: deque[Lane] = deque()
         self._large: deque[Lane] = deque()
         self._messages = 0
@@ -64,12 +65,12 @@ class Mailbox:
         self._is_awake = False
 
     def put(self, lane: Lane, message: Message) -> None:
-        """Leave a message. When there is no room the oldest of the lane, or of the lane whose turn
-        it is, large ones before small ones, is dropped and counted; one message alone always has
+        """Queue a message. Without room the oldest message of its lane is dropped and counted, or
+        the oldest one of the lane whose turn it is, large ones first. A single message always has
         room."""
         with self._lock:
             waiting = lane.waiting
-            if len(waiting) >= lane.keep:
+            if len(waiting) >= lane.depth:
                 self._drop(lane)
             waiting.append(message)
             self._place(lane)
@@ -87,10 +88,10 @@ class Mailbox:
         self._wake()
 
     def take(self, limit: int) -> tuple[list[tuple[Lane, Message]], bool]:
-        """Up to `limit` messages, one of each lane in turn, and whether that is not all.
+        """Take up to `limit` messages, one of each lane in turn; True if there are more.
 
-        All that are small go before those that are large. These are taken one by one, as long as
-        there is not much already, so that what comes meanwhile waits for little.
+        All small messages go before the large ones. Large ones are taken only until the batch has
+        reached TAKEN_BYTES, so that messages that come meanwhile are not delayed for long.
         """
         taken: list[tuple[Lane, Message]] = []
         size = 0
@@ -113,7 +114,7 @@ class Mailbox:
         return taken, not is_all
 
     def _place(self, lane: Lane) -> None:
-        """Let a lane have its turn among those of its kind; it stays where it is, if it can."""
+        """Queue a lane by the size of its next message; it keeps its turn if already there."""
         wanted = None
         if lane.waiting:
             wanted = self._large if len(lane.waiting[0].payload) > LARGE else self._small

@@ -1,4 +1,4 @@
-"""What a flow counts and measures of what it carries: counters, rates, latency."""
+"""Metrics of a flow: counters, rates, latency."""
 
 from __future__ import annotations
 
@@ -7,39 +7,39 @@ from collections import deque
 from dataclasses import dataclass, field, fields
 from itertools import accumulate
 
-#: The upper bounds of the classes of latency, in seconds; one more class is for all above.
+#: The upper bounds of the latency histogram's buckets, in seconds; one more bucket is for the rest.
 BOUNDS = (
     *(0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05),
     *(0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
 )
 
-#: Seconds that a rate is the mean of.
+#: A rate is the mean over so many seconds.
 RATE_WINDOW = 5.0
 
 
 class Latency:
-    """A histogram of seconds."""
+    """A histogram of latencies, in seconds."""
 
     __slots__ = ("counts", "total")
 
     def __init__(self) -> None:
-        #: How many were in each class of BOUNDS, and above all of them.
+        #: The count of each bucket of BOUNDS, and of the one above.
         self.counts = [0] * (len(BOUNDS) + 1)
-        #: The sum of all, in seconds.
+        #: The sum of all latencies, in seconds.
         self.total = 0.0
 
     def observe(self, seconds: float) -> None:
-        """Count one. Less than nothing, from a clock that is ahead of ours, is nothing."""
+        """Count a latency. A negative one, from a clock that is ahead of ours, counts as 0."""
         self.counts[bisect_left(BOUNDS, seconds)] += 1
         self.total += max(seconds, 0.0)
 
     def add(self, other: Latency) -> None:
-        """Count all that the other has counted."""
+        """Add the counts of another histogram."""
         self.counts = [one + more for one, more in zip(self.counts, other.counts, strict=True)]
         self.total += other.total
 
     def quantile(self, share: float) -> float | None:
-        """Seconds that so large a share took at the most, taken as even within a class."""
+        """The quantile in seconds, interpolated within its bucket; None without any latencies."""
         wanted = share * sum(self.counts)
         if not wanted:
             return None
@@ -54,14 +54,15 @@ class Latency:
 
 @dataclass(eq=False, slots=True)
 class FlowCounters:
-    """What is counted in one direction, all from the start; `bytes` are payload on MQTT.
+    """The counters of one direction, from the start; `bytes` are payload on MQTT.
 
-    `lost` are those that ROS's middleware says it lost before they came here, `dropped` did not fit
-    into the mailbox, `throttled` were above the rate or the budget of bytes, `skipped` were not
-    sent to a client that was slow, which counts once for each such client, `errors` could not be
-    converted or published. Of commands, `expired` came too late, `refused` were against the rules,
-    `clamped` went on with other numbers; `stops` are stop messages that a route published by
-    itself. `latency` is of a sample of the messages, from the publisher's time stamp to the broker.
+    `lost` messages were lost by ROS's middleware before they came here, as it reports; `dropped`
+    ones did not fit into the mailbox; `throttled` ones exceeded the rate limit or the byte budget;
+    `skipped` ones were not sent to a slow client, counted once for each such client; `errors` could
+    not be converted or published. Of commands, `expired` ones came too late, `refused` ones
+    violated the rules, `clamped` ones were published with other numbers; `stops` are stop messages
+    that a route has published by itself. `latency` is of a sample of the messages, from the
+    publisher's time stamp to the broker.
     """
 
     messages: int = 0
@@ -79,7 +80,7 @@ class FlowCounters:
     latency: Latency = field(default_factory=Latency)
 
     def add(self, other: FlowCounters) -> None:
-        """Count all that the other has counted; its last error is now the last."""
+        """Add the counts of others; their last error becomes the last one."""
         for item in fields(self):
             if item.type == "int":
                 total = getattr(self, item.name) + getattr(other, item.name)
@@ -89,7 +90,7 @@ class FlowCounters:
 
 
 class Meter:
-    """Messages and bytes a second, as the mean of the last RATE_WINDOW."""
+    """Messages and bytes per second, as the mean over RATE_WINDOW."""
 
     __slots__ = ("_points",)
 
@@ -97,7 +98,7 @@ class Meter:
         self._points: deque[tuple[float, int, int]] = deque()
 
     def tick(self, now: float, messages: int, size: int) -> None:
-        """Take in the counters, once a second or so."""
+        """Record the counters; called about once a second."""
         points = self._points
         points.append((now, messages, size))
         while len(points) > 2 and points[1][0] <= now - RATE_WINDOW:
@@ -105,7 +106,7 @@ class Meter:
 
     @property
     def rates(self) -> tuple[float, float]:
-        """Messages a second, and bytes a second."""
+        """Messages per second, and bytes per second."""
         if len(self._points) < 2:
             return 0.0, 0.0
         (then, messages, size), (now, more, larger) = self._points[0], self._points[-1]

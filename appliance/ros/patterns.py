@@ -1,4 +1,4 @@
-"""Which names on the bus are meant: `/reset`, `/arm/*`, `/camera/**`, `!/camera/raw`."""
+"""Names and patterns of routes: `/reset`, `/arm/*`, `/camera/**`, `!/camera/raw`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from appliance.ros.skipped import Skipped, SkipReason
 
 
 def compile_pattern(text: str, *, hidden: bool = False) -> re.Pattern[str]:
-    """What matches the names that a pattern stands for: `*` is part of a name, `**` of a path.
+    """Compile a pattern: `*` matches within a part of a name, `**` matches any path.
 
-    Hidden names, with a token that begins with `_`, have to be spelt out in the pattern, unless
-    they are wanted as well.
+    A hidden name, with a part that begins with `_`, matches only if the pattern spells out such a
+    part, or if `hidden` is set.
     """
     parts = re.split(r"(\*\*|\*)", text)
     wild = {"**": ".*", "*": "[^/]*"}
@@ -22,18 +22,18 @@ def compile_pattern(text: str, *, hidden: bool = False) -> re.Pattern[str]:
 
 
 def is_plain(name: str) -> bool:
-    """Whether it is the name of one thing, and no pattern and nothing that is left out."""
+    """Whether it is a single name: neither a pattern nor an exclusion."""
     return "*" not in name and not name.startswith("!")
 
 
 class Names:
-    """A list of names and patterns; one that begins with `!` takes names out again."""
+    """A list of names and patterns; those that begin with `!` exclude names."""
 
     def __init__(self, patterns: Iterable[str]) -> None:
         every = list(patterns)
         wanted = [text for text in every if not text.startswith("!")]
         self._wanted = [compile_pattern(text) for text in wanted]
-        self._spoken_of = [compile_pattern(text, hidden=True) for text in wanted]
+        self._mentioned = [compile_pattern(text, hidden=True) for text in wanted]
         self._excluded = [
             (text, compile_pattern(text[1:], hidden=True)) for text in every if text[0] == "!"
         ]
@@ -44,8 +44,8 @@ class Names:
         )
 
     def refusal(self, name: str) -> tuple[SkipReason, str] | None:
-        """Why a name that a pattern speaks of is not among them; None when it is, or none does."""
-        if name in self or not any(pattern.fullmatch(name) for pattern in self._spoken_of):
+        """Why a name that matches a pattern is not included; None if it is, or matches none."""
+        if name in self or not any(pattern.fullmatch(name) for pattern in self._mentioned):
             return None
         for text, pattern in self._excluded:
             if pattern.fullmatch(name):
@@ -54,11 +54,11 @@ class Names:
 
 
 class NamedRoute(Protocol):
-    """A route for names and patterns."""
+    """A route that has names and patterns."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names, patterns, and what is left out."""
+        """The names, patterns and exclusions."""
 
 
 NamedRouteT = TypeVar("NamedRouteT", bound=NamedRoute)
@@ -69,8 +69,8 @@ def assign(
     found: Mapping[str, Sequence[str]],
     fits: Callable[[NamedRouteT, str], bool],
 ) -> dict[str, NamedRouteT]:
-    """The route of each name: one that spells it out, whether it was found or not; else, of those
-    that were found, the first that has a pattern for it and that it `fits`."""
+    """Assign a route to each name: the one that spells it out, whether it was found or not; for
+    other found names, the first one with a pattern that matches and for which it `fits`."""
     assigned = {name: route for route in reversed(routes) for name in route.names if is_plain(name)}
     for route in routes:
         names = Names(route.names)
@@ -87,7 +87,7 @@ def refusals(
     direction: str,
     misfit: Callable[[NamedRouteT, str], tuple[SkipReason, str] | None],
 ) -> list[Skipped]:
-    """Of the names that were found, those that a route speaks of and none was assigned to."""
+    """The found names that match a pattern of a route and were not assigned to any route."""
     skips: dict[str, Skipped] = {}
     for route in routes:
         names = Names(route.names)

@@ -1,4 +1,4 @@
-"""What QoS to use, given the endpoints found on a topic: pure (CONVENTIONS, QoS)."""
+"""Chooses the QoS for a topic from the endpoints found on it; pure."""
 
 from __future__ import annotations
 
@@ -7,51 +7,51 @@ from collections.abc import Sequence
 from appliance.ros.node import Durability, Endpoint, QosProfile, Reliability
 from appliance.ros.payload.definitions import Bulk
 
-#: ROS's own default, and enough for a reader that is fast.
+#: ROS's own default, and enough for a fast reader.
 DEPTH = 10
 
-#: For messages that are small: a burst of them, or a second of 1 kHz in which nobody took any.
+#: The depth for small messages: a burst, or a second at 1 kHz in which none was taken.
 BURST = 1000
 
-#: What a subscription has room for, by what can make its messages large.
+#: The depth of a subscription, by what can make its messages large.
 ROOM = {Bulk.NOTHING: BURST, Bulk.NUMBERS: 100, Bulk.BYTES: DEPTH}
 
-#: For requests and answers: many clients may wait for theirs at the same time. With ROS's own depth
-#: of 10, what comes on top of these is lost, and who asked waits in vain.
+#: For requests and responses: many clients may await a response at the same time. With ROS's own
+#: depth of 10 the others are lost, and their clients never get a response.
 CALLS = QosProfile(depth=BURST)
 
-#: Publishers' depths add up to no more than this: a stalled reader holds so many samples.
+#: The limit for the sum of the publishers' depths: a stalled reader holds so many samples.
 MAX_DEPTH = 100
 
 
 def subscription_qos(
     publishers: Sequence[Endpoint], keep: int = 1, bulk: Bulk = Bulk.BYTES
 ) -> QosProfile:
-    """What to subscribe with, to be matched with all of `publishers` and lose the least.
+    """The QoS to subscribe with: it matches all of `publishers` and loses the least.
 
-    Without publishers: best effort and volatile, which matches whatever appears. `keep` is how many
-    samples the route wants to queue; the middleware holds at least as many, and a burst of messages
-    as far as their `bulk` allows: what it has no room for is lost, whoever listens on MQTT.
+    Without publishers it is best effort and volatile, which matches any. `keep` is how many samples
+    the route queues; the middleware holds at least as many, and a burst of messages if their `bulk`
+    allows it: a sample that it has no room for is lost for all of MQTT.
     """
     reliable = all(end.qos.reliability is Reliability.RELIABLE for end in publishers)
     latched = all(end.qos.durability is Durability.TRANSIENT_LOCAL for end in publishers)
-    # A late subscriber's history has to have room for what every publisher keeps for it, and a
-    # topic without keys has one history for all of them (/tf_static: many that keep one sample
-    # each), so their depths add up. A depth that discovery did not tell counts as one.
-    kept = sum(max(1, end.qos.depth) for end in publishers) if latched else 0
+    # A late subscriber's history needs room for the samples that every publisher holds for it, and
+    # a topic without keys has one history for all publishers (/tf_static: many with one sample
+    # each), so their depths add up. A depth that discovery does not report counts as one.
+    latched_depth = sum(max(1, end.qos.depth) for end in publishers) if latched else 0
     return QosProfile(
         Reliability.RELIABLE if publishers and reliable else Reliability.BEST_EFFORT,
         Durability.TRANSIENT_LOCAL if publishers and latched else Durability.VOLATILE,
-        max(keep, ROOM[bulk], min(kept, MAX_DEPTH)),
+        max(keep, ROOM[bulk], min(latched_depth, MAX_DEPTH)),
     )
 
 
 def publisher_qos(subscribers: Sequence[Endpoint], keep: int = 1) -> QosProfile:
-    """What to publish with, to be matched with all of `subscribers`.
+    """The QoS to publish with: it matches all of `subscribers`.
 
-    Reliable is matched with every subscription. Transient local would be too, but it hands the last
-    message, which may be an old command, to whoever subscribes late: only where one asks for it,
-    and no more of them than the `keep` of the route.
+    Reliable matches every subscription. So does transient local, but it delivers the last message,
+    which may be an old command, to late subscribers: it is used only if a subscription requests it,
+    and with no more samples than the `keep` of the route.
     """
     latched = any(end.qos.durability is Durability.TRANSIENT_LOCAL for end in subscribers)
     return QosProfile(

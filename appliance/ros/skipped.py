@@ -1,4 +1,4 @@
-"""What is on the bus, or named by a route, and not bridged; and why."""
+"""What is on the bus, or named by a route, but not bridged, and why."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
-#: In the order in which somebody wants to know of them.
+#: The reasons, the most important one first.
 SkipReason: TypeAlias = Literal[
-    "problem",  # it cannot be set up: its type is not installed, its node does not answer …
+    "problem",  # it cannot be opened: its type is not installed, its node does not answer …
     "absent",  # a route names it, and it is not there
     "two_types",  # another type that is on the same name is bridged
-    "left_out",  # a route leaves it out by `!`
+    "left_out",  # a route excludes it by `!`
     "hidden",  # a part of its name begins with `_`
     "other_type",  # a route's pattern is for other types
-    "of_every_node",  # every node has it, and patterns do not take it
+    "of_every_node",  # every node has it, and patterns do not include it
 ]
 _ORDER: tuple[SkipReason, ...] = (
     "problem",
@@ -27,14 +27,17 @@ _ORDER: tuple[SkipReason, ...] = (
     "of_every_node",
 )
 
-#: Entries of a retained message: a bus may have any number of names.
-MOST_TOLD = 100
+#: The most entries in a summary: a bus may have any number of names.
+MAX_ENTRIES = 100
 
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """A name that is not bridged in a direction, as in `BridgedTopic`, or as `service`, `action` or
-    `parameters`. `type` is empty where it is not known."""
+    """A name that is not bridged.
+
+    `direction` is as in `BridgedTopic`, or `service`, `provided`, `action` or `parameters`. `type`
+    is empty if it is not known.
+    """
 
     ros: str
     direction: str
@@ -44,14 +47,14 @@ class Skipped:
 
 
 def ordered(skips: Iterable[Skipped]) -> list[Skipped]:
-    """What matters most first, and once each."""
+    """The most important reasons first, without duplicates."""
     return sorted(set(skips), key=lambda one: (_ORDER.index(one.why), one.ros, one.direction))
 
 
 def summary(skips: list[Skipped]) -> dict[str, Any]:
-    """What `{robot}/_appliance/skipped` says: how many there are, and the first of them."""
+    """The content of `{robot}/_appliance/skipped`: the counts, and the first entries."""
     return {
         "count": len(skips),
         "by_reason": dict(Counter(one.why for one in skips)),
-        "skipped": [asdict(one) for one in skips[:MOST_TOLD]],
+        "skipped": [asdict(one) for one in skips[:MAX_ENTRIES]],
     }

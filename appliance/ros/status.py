@@ -1,4 +1,4 @@
-"""How the bridge is doing: what MQTT, /diagnostics and `appliance routes` are told of it."""
+"""The status of the bridge, for MQTT, /diagnostics and `appliance routes`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from appliance.ros.topics.flow import BridgedTopic, BridgeRoute, Direction, Flow
 
 @dataclass(frozen=True, slots=True)
 class LatencyStatus:
-    """Milliseconds that half of the messages, and 99 of 100, took at the most."""
+    """The median and the 99th percentile of the latency, in milliseconds."""
 
     p50: float
     p99: float
@@ -20,12 +20,11 @@ class LatencyStatus:
 
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
-    """What is bridged now; as JSON an entry of `{robot}/_appliance/routes`.
+    """A topic that is bridged now; as JSON an entry of `{robot}/_appliance/routes`.
 
-    `rate` is in messages a second, `size` the mean payload in bytes, `latency_ms` from the
-    publisher on ROS to the broker, None while none was measured. `last_error` is what was wrong
-    with the last message that was not carried. Counts are since the topic came;
-    for what is counted see `FlowCounters`.
+    `rate` is in messages per second, `size` the mean payload in bytes, `latency_ms` from the
+    publisher on ROS to the broker, None if none was measured. `last_error` is the problem with the
+    last message that was not carried. The counters are `FlowCounters` since the topic came.
     """
 
     ros: str
@@ -49,10 +48,10 @@ class TopicStatus:
 
 @dataclass(frozen=True, slots=True)
 class RouteStatus:
-    """What a route carries in one direction, and what it has counted since the start.
+    """What a route carries in one direction, and its counters since the start.
 
-    `rate` and `byte_rate` are a second; `commanding` names who holds the lease of an exclusive
-    route, and of which topic. For what is counted see `FlowCounters`.
+    `rate` and `byte_rate` are per second; `commanding` has the topics of an exclusive route and the
+    clients that hold their leases. For the counters see `FlowCounters`.
     """
 
     settings: TopicSettings
@@ -77,7 +76,7 @@ class RouteStatus:
 
 
 def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
-    """How a flow that is bridged is doing."""
+    """The status of a flow that is bridged."""
     counters = flow.counters
     return TopicStatus(
         bridged.ros,
@@ -101,7 +100,7 @@ def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
 
 
 def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
-    """How a route is doing, with its flows and those that it had."""
+    """The status of a route, with its present and past flows."""
     total = FlowCounters()
     for counters in (route.past, *(flow.counters for flow in flows)):
         total.add(counters)
@@ -130,7 +129,7 @@ def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
 
 
 def latency_status(latency: Latency) -> LatencyStatus | None:
-    """The histogram in two numbers, None for an empty one."""
+    """The summary of a histogram, None for an empty one."""
     p50, p99 = latency.quantile(0.5), latency.quantile(0.99)
     if p50 is None or p99 is None:
         return None

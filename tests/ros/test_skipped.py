@@ -16,7 +16,7 @@ from appliance.ops import control
 from appliance.ros.bridge import TopicSettings
 from appliance.ros.node import FakeNode
 from appliance.ros.payload.definitions import UnknownTypeError
-from appliance.ros.skipped import MOST_TOLD
+from appliance.ros.skipped import MAX_ENTRIES
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 TRIGGER = "std_srvs/srv/Trigger"
@@ -191,11 +191,11 @@ async def test_what_is_called(harness):
 
 async def test_what_is_told_on_mqtt_is_bounded(harness):
     harness.start(service("/arm/*"), topics=[topic(["/**", "!/a/**"])])
-    for number in range(MOST_TOLD + 50):
+    for number in range(MAX_ENTRIES + 50):
         harness.node.add_publisher(f"/a/topic_{number}", STRING)
     await look(harness)
-    assert told(harness)["count"] == MOST_TOLD + 50
-    assert len(told(harness)["skipped"]) == MOST_TOLD
+    assert told(harness)["count"] == MAX_ENTRIES + 50
+    assert len(told(harness)["skipped"]) == MAX_ENTRIES
     await harness.bridge.stop()
     assert told(harness)["count"] == 0
 

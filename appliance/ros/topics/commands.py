@@ -24,7 +24,7 @@ from appliance.ros.node import BusError, QosProfile, RosNode
 from appliance.ros.payload.converter import ConversionError, Converter, Converters
 from appliance.ros.payload.payloads import unpacked_size
 from appliance.ros.topics.conversions import LITTLE, size_of
-from appliance.ros.topics.flow import REPORT_INTERVAL, BridgeRoute, LogFunction
+from appliance.ros.topics.flow import LOG_INTERVAL, BridgeRoute, LogFunction
 from appliance.ros.topics.lease import OVERTAKEN, Lease
 from appliance.ros.topics.rules import CommandRules, FieldLimits
 from appliance.ros.topics.staleness import (
@@ -871,5 +871,5 @@ class Commands(ToRos):
         """Log something that may happen with every message at most once a minute."""
         now = self._context.entries.time()
         if now >= self._logged.get(what, -math.inf):
-            self._logged[what] = now + REPORT_INTERVAL
+            self._logged[what] = now + LOG_INTERVAL
             self._log(level, text, self, *args)

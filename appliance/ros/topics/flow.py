@@ -1,7 +1,7 @@
-"""Routes, and what they come to: one ROS topic carried in one direction is a flow.
+"""Routes of topics and their flows: a flow carries one ROS topic in one direction.
 
-A flow follows its topic on the ROS thread: `look` finds the type and the QoS to use from the
-endpoints that are there, and sets up or sets anew what carries the messages.
+A flow follows its topic on the ROS thread: `poll_graph` derives the type and the QoS from the
+endpoints on the topic, and opens or reopens the subscription or publisher that carries messages.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from appliance.ros.topics.rules import CommandRules
 
 Direction: TypeAlias = Literal["to_mqtt", "to_ros"]
 
-#: Seconds between two lines in the log about the same route's errors.
-REPORT_INTERVAL = 60.0
+#: Errors of a flow are logged at most once in so many seconds.
+LOG_INTERVAL = 60.0
 
-#: Seconds that a sample of our own may take to come back; in one process it is microseconds.
+#: Seconds within which a sample of our own comes back; within one process it takes microseconds.
+#: And the most samples that are remembered for that.
 ECHO_TIME = 2.0
 ECHO_SAMPLES = 1000
 
@@ -41,15 +42,16 @@ _NUMBERS = itertools.count()
 
 @dataclass(frozen=True, slots=True)
 class TopicSettings:
-    """A route. `ros` is the name of a topic, or a pattern, or several of both: `*` is part of a
-    name, `**` of a path, and what begins with `!` is left out again. `mqtt` is a topic; a `{ros}`
-    in it stands for the ROS name.
+    """The settings of a route for topics.
 
-    None is: no limit (`rate`, in Hz, and `bytes_per_second` of payload), found from the graph
-    (`type`, which may have a `*` in it too), as the publishers' QoS says (`qos`, `retain`). `keep`
-    is how many messages of a topic wait for a busy broker: the latest, or so many. `fields` are the
-    paths of those that go to MQTT, all of them when there are none; `limits` are for what comes
-    from MQTT.
+    `ros` is the name of a topic, or a pattern, or several of both: `*` matches within a part of a
+    name, `**` matches a path, and a leading `!` excludes. `mqtt` is a topic; a `{ros}` in it is
+    replaced by the ROS name.
+
+    None means: no limit (`rate`, in Hz, and `bytes_per_second` of payload), taken from the graph
+    (`type`, which may contain a `*`, too), taken from the publishers' QoS (`qos`, `retain`). `keep`
+    is how many messages of a topic are queued for a busy broker. `fields` are the paths of the
+    fields that go to MQTT, all of them if empty; `limits` are for messages from MQTT.
     """
 
     ros: str | tuple[str, ...]
@@ -65,7 +67,7 @@ class TopicSettings:
     fields: tuple[str, ...] = ()
     bytes_per_second: int | None = None
     limits: InputLimits = field(default_factory=InputLimits)
-    #: What holds for what goes to ROS; None for no rules but the types.
+    #: The command rules for messages to ROS; None for no rules but the types.
     rules: CommandRules | None = None
 
     @property
@@ -75,7 +77,7 @@ class TopicSettings:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """`ros`, as many as there are."""
+        """`ros` as a tuple."""
         return (self.ros,) if isinstance(self.ros, str) else self.ros
 
     @property
@@ -91,18 +93,18 @@ class BridgeRoute:
         self.settings = settings
         self.direction: Direction = direction
         self.is_pattern = settings.is_pattern
-        #: What those of its flows have counted that have ended.
+        #: The totals of flows of this route that have ended.
         self.past = FlowCounters()
         self._names = Names(settings.names)
         self._types = compile_pattern(settings.type) if settings.type else None
 
     def matches(self, ros: str, types: Iterable[str]) -> bool:
-        """Whether a topic that carries these types is one of this route's."""
+        """Whether the route is for this topic, which carries these types."""
         return ros in self._names and any(map(self.fits, types))
 
     def refusal(self, ros: str, types: Iterable[str]) -> tuple[SkipReason, str] | None:
-        """Why a topic that the route's pattern speaks of is not one of its; None when it is, or
-        when no pattern speaks of it."""
+        """Why the route does not take a topic that matches its pattern; None when it takes it, or
+        when no pattern matches."""
         if ros not in self._names:
             return self._names.refusal(ros)
         if any(map(self.fits, types)):
@@ -110,13 +112,13 @@ class BridgeRoute:
         return "other_type", f"the route takes {self.settings.type}"
 
     def fits(self, type_name: str) -> bool:
-        """Whether it is what the route says of the type, if it says something."""
+        """Whether the route is for this type: it is, unless the route names another."""
         return self._types is None or self._types.fullmatch(type_name) is not None
 
 
 @dataclass(frozen=True, slots=True)
 class BridgedTopic:
-    """What a flow carries now."""
+    """What a flow carries now; an immutable snapshot."""
 
     ros: str
     mqtt: str
@@ -132,12 +134,12 @@ class LogFunction(Protocol):
 
 
 class EchoFilter:
-    """Tells samples of our own publisher from others', on a topic that is bridged both ways.
+    """Recognizes samples of our own publisher on a topic that is bridged both ways.
 
-    They are told by their content: rclpy cannot ask the middleware to leave out local publishers,
-    and what it says about a message's sender is missing up to Jazzy and ends EventsExecutor in
-    Kilted. A message that another node publishes with the same content at the same time counts as
-    the echo, and the echo in its place as the other's message: on MQTT nobody can tell.
+    They are recognized by their content: rclpy cannot ask the middleware to ignore local
+    publishers, and its information on a message's sender is missing up to Jazzy and ends
+    EventsExecutor in Kilted. If another node publishes the same content at the same time, its
+    message may be taken for the echo and the echo for its message: on MQTT that is no difference.
     """
 
     def __init__(self, serialization: Serialization = CDR) -> None:
@@ -148,12 +150,13 @@ class EchoFilter:
         self._sent: deque[tuple[float, bytes]] = deque(maxlen=ECHO_SAMPLES)
 
     def sent(self, cdr: bytes) -> None:
-        """The sample is about to be published. Without CDR's header, where DDS notes padding."""
+        """Remember a sample that is about to be published, without the header of CDR, in which DDS
+        notes padding."""
         with self._lock:
             self._sent.append((monotonic() + ECHO_TIME, cdr[self._header :]))
 
     def is_own(self, cdr: bytes) -> bool:
-        """Whether the sample received is one that was sent and has not come back yet."""
+        """Whether a received sample is one that was sent and has not come back yet."""
         if not self._sent:
             return False
         now = monotonic()
@@ -169,10 +172,14 @@ class EchoFilter:
 
 
 class Flow(ABC):
-    """One ROS topic carried in one direction; its methods are for the ROS thread."""
+    """Carries one ROS topic in one direction.
+
+    `skips` is for any thread, `fail` and `refuse` are for the thread that carries messages, all
+    else is for the ROS thread.
+    """
 
     direction: ClassVar[Direction]
-    #: Why a topic that a route names may not be carried yet.
+    #: Why a topic that a route names is not carried yet.
     absence: ClassVar[str]
 
     def __init__(
@@ -190,31 +197,31 @@ class Flow(ABC):
         #: For the loop's thread.
         self.meter = Meter()
         self.bridged: BridgedTopic | None = None
-        #: A number of its own: of so many flows, not all take their time at the same look.
+        #: Spreads the thorough polls of all flows over several polls.
         self.number = next(_NUMBERS)
-        #: Whether a pattern found the topic: it is then bridged while it has other ends.
+        #: Whether a pattern found the topic: then it is bridged while other nodes have endpoints.
         self.is_matched = route.is_pattern
         self._converters = converters
         self._log = log
         self._count: tuple[int, int] | None = None
-        #: Type, QoS and type hash that were last set up, or refused.
-        self._wanted: tuple[str, QosProfile, str | None] | None = None
+        #: Type, QoS and type hash that were last opened, or failed to be.
+        self._opened_for: tuple[str, QosProfile, str | None] | None = None
         #: Why the last set-up failed.
         self._problem: str | None = None
-        #: Whether the next look must set up what this one could not.
-        self._is_due = False
-        self._foreign: set[str] = set()
-        self._report_at = 0.0
+        #: Whether the next poll must try again to open it.
+        self._must_retry = False
+        self._other_types: set[str] = set()
+        self._log_next_at = 0.0
 
     def poll_graph(self, node: RosNode, thorough: bool) -> bool:
-        """Follow the graph; True when what is bridged has changed.
+        """Follow the graph; returns whether what is bridged has changed.
 
-        The endpoints are asked for only when their number has changed, or the look is thorough.
+        The endpoints are asked for only if their number has changed, or the poll is thorough.
         """
         count = node.count(self.ros)
-        if count == self._count and not thorough and not self._is_due:
+        if count == self._count and not thorough and not self._must_retry:
             return False
-        self._is_due = False
+        self._must_retry = False
         self._count = count
         endpoints = self._find(node)
         found = {endpoint.type for endpoint in endpoints}
@@ -222,9 +229,9 @@ class Flow(ABC):
         if self.is_matched and not fitting:
             was_bridged = self.bridged is not None
             self.close()
-            self._wanted = None
+            self._opened_for = None
             return was_bridged
-        known = self._wanted[0] if self._wanted else None
+        known = self._opened_for[0] if self._opened_for else None
         if not self.is_matched and self.settings.type is not None:
             type_name = self.settings.type
         elif fitting:
@@ -233,27 +240,27 @@ class Flow(ABC):
             type_name = known
         else:
             return False
-        self._log_foreign(found - {type_name}, type_name)
+        self._log_other_types(found - {type_name}, type_name)
         endpoints = [endpoint for endpoint in endpoints if endpoint.type == type_name]
-        if not endpoints and self._wanted is not None and self._wanted[0] == type_name:
-            return False  # they have left; all stays as it is for their return
-        # Towards ROS nobody is told the hash, and another publisher would first have to be found.
+        if not endpoints and self._opened_for is not None and self._opened_for[0] == type_name:
+            return False  # the endpoints have left; keep everything open for their return
+        # Towards ROS the hash is not needed, and a new publisher would first have to be discovered.
         ends = endpoints if self.direction == "to_mqtt" else []
         hashes = [end.type_hash for end in ends if end.type_hash]
         wanted = (type_name, self._choose_qos(endpoints, type_name), min(hashes, default=None))
         before = self.bridged
-        if wanted == self._wanted and (before is not None or self._problem is None):
+        if wanted == self._opened_for and (before is not None or self._problem is None):
             return False
-        self._wanted = wanted
+        self._opened_for = wanted
         if before is not None and before.type != type_name:
-            # The middleware knows one type a topic, until the executor has let go of the last end.
+            # The middleware allows one type per topic until the executor has released the last end.
             self.close()
-            self._wanted, self._is_due = None, True
+            self._opened_for, self._must_retry = None, True
         else:
-            self._set_up(node, *wanted)
+            self._try_open(node, *wanted)
         return self.bridged != before
 
-    def _set_up(
+    def _try_open(
         self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None
     ) -> None:
         encoding = self.settings.encoding
@@ -261,7 +268,7 @@ class Flow(ABC):
             detail = self._open(node, type_name, qos, type_hash)
         except (BusError, UnknownTypeError, ConversionError) as error:
             self.close()
-            self._is_due = isinstance(error, BusError)
+            self._must_retry = isinstance(error, BusError)
             problem = self.counters.last_error = str(error)
             if problem != self._problem:
                 self._problem = problem
@@ -272,21 +279,21 @@ class Flow(ABC):
         self._log(logging.INFO, "%s: %s as %s; ROS %s%s", self, type_name, encoding, qos, detail)
 
     def reset(self, problem: str) -> None:
-        """A fault: what was set up is closed, and the next look sets it up again."""
+        """Close everything after a fault; the next poll opens it again."""
         self._problem = self.counters.last_error = problem
-        self._wanted, self._is_due = None, True
-        with suppress(Exception):  # it was counted, and what there is of it may be half a thing
+        self._opened_for, self._must_retry = None, True
+        with suppress(Exception):  # the fault was counted, and it may be half open
             self.close()
         self.bridged = None
 
     def skips(self) -> list[Skipped]:
-        """What of the topic is not carried; from any thread."""
-        problem, count, wanted, bridged = self._problem, self._count, self._wanted, self.bridged
+        """What of the topic is not carried, and why; from any thread."""
+        problem, count, wanted, bridged = self._problem, self._count, self._opened_for, self.bridged
         if bridged is not None:
             reason = f"the topic carries {bridged.type} as well, which is bridged"
             return [
                 Skipped(self.ros, self.direction, name, "two_types", reason)
-                for name in self._foreign
+                for name in self._other_types
             ]
         if problem is not None:
             type_name = wanted[0] if wanted else ""
@@ -296,9 +303,9 @@ class Flow(ABC):
         type_name = self.settings.type or ""
         return [Skipped(self.ros, self.direction, type_name, "absent", self.absence)]
 
-    def _log_foreign(self, types: set[str], chosen: str) -> None:
-        if types != self._foreign:
-            self._foreign = types
+    def _log_other_types(self, types: set[str], chosen: str) -> None:
+        if types != self._other_types:
+            self._other_types = types
             for name in sorted(types):
                 self._log(
                     logging.WARNING,
@@ -309,20 +316,20 @@ class Flow(ABC):
                 )
 
     def fail(self, problem: str) -> None:
-        """Count a message that could not be carried, and say so once a minute."""
+        """Count a message that could not be carried, and log that at most once a minute."""
         self.counters.errors += 1
         self._log_uncarried(problem, self.counters.errors)
 
     def refuse(self, problem: str) -> None:
-        """Count a message that the route's rules forbid, and say so once a minute."""
+        """Count a message that violates the route's rules, and log that at most once a minute."""
         self.counters.refused += 1
         self._log_uncarried(problem, self.counters.refused)
 
     def _log_uncarried(self, problem: str, count: int) -> None:
         self.counters.last_error = problem
         now = monotonic()
-        if now >= self._report_at:
-            self._report_at = now + REPORT_INTERVAL
+        if now >= self._log_next_at:
+            self._log_next_at = now + LOG_INTERVAL
             self._log(
                 logging.WARNING,
                 "%s: a message %s (%d so far)",
@@ -333,7 +340,7 @@ class Flow(ABC):
 
     @abstractmethod
     def _find(self, node: RosNode) -> list[Endpoint]:
-        """The endpoints of other nodes that tell type and QoS."""
+        """The endpoints of other nodes from which type and QoS are derived."""
 
     @abstractmethod
     def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
@@ -341,20 +348,20 @@ class Flow(ABC):
 
     @abstractmethod
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
-        """Set up, or set anew, what carries the messages; returns more for the log.
+        """Open or reopen the subscription or publisher; returns details for the log.
 
         Raises BusError, UnknownTypeError, ConversionError.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Carry nothing any more."""
+        """Close the subscription or publisher; nothing is carried any more."""
 
     def on_bus_lost(self) -> None:
-        """The bus is gone, and with it all that was set up."""
-        self.bridged = self._count = self._wanted = None
+        """The bus is gone, and with it the subscription or publisher."""
+        self.bridged = self._count = self._opened_for = None
 
     @property
     def commanding(self) -> str | None:
-        """The client that may command alone, None where there is none."""
+        """The client that holds the lease of an exclusive route, if there is one."""
         return None

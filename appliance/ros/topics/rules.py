@@ -1,8 +1,7 @@
-"""What holds for commands on their way to ROS: the settings of a route, and limits on its fields.
+"""Rules for commands to ROS: the settings of a route, and limits on the fields of messages.
 
-A limit is compiled once a type. A message is changed only where a number is outside a `clamp`, and
-refused where a value is not among those of an `allow`, or where a number that is to be limited is
-none.
+A limit is compiled once per type. A message is changed only if a number is outside a `clamp`; it is
+rejected if a value is not one of an `allow`, or if a number to be clamped is NaN or infinite.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ from appliance.ros.payload.definitions import (
 )
 from appliance.ros.payload.fallback import ConversionError
 
-#: What a limit does to one value: gives it back, or another, or raises ConversionError.
+#: Applies a limit to a value: returns it, or another one, or raises ConversionError.
 Limit: TypeAlias = Callable[[Any, str], Any]
 
 
 @dataclass(frozen=True, slots=True)
 class OnSilence:
-    """The stop message `publish`, in JSON, for when nothing has come for `after` seconds.
+    """The stop message `publish`, in JSON, to be published after `after` seconds without a command.
 
-    `disconnect`: whose last command was another than this one is disconnected when it falls silent
-    and its computer does not answer. What it has sent and the network still holds is then lost, and
-    cannot move the robot.
+    With `disconnect`, a client whose last command was not this one is disconnected when it falls
+    silent and its computer does not answer. Commands that the network still holds are then lost,
+    and cannot move the robot.
     """
 
     after: float
@@ -45,9 +44,9 @@ class OnSilence:
 
 @dataclass(frozen=True, slots=True)
 class CommandRules:
-    """When a message may reach ROS, and with what in it; times in seconds.
+    """When a message may reach ROS, and with which values; times in seconds.
 
-    `clamp` has the least and the most of a field, `allow` its values, by the field's path.
+    `clamp` has the bounds of fields, `allow` their values, by the field's path.
     """
 
     expire: float | None = None
@@ -60,22 +59,22 @@ class CommandRules:
 
     @property
     def needs_type(self) -> bool:
-        """Whether there is something in it that holds for messages of some type only."""
+        """Whether the rules can only be checked against the type of the messages."""
         return bool(self.clamp or self.allow or self.on_silence)
 
     @property
     def oldest(self) -> float:
-        """The age from which a message is not published any more."""
+        """Messages that are older than this are not published."""
         if self.expire is not None:
             return self.expire
         return math.inf if self.on_silence is None else self.on_silence.after
 
 
 class FieldLimits:
-    """The limits of a route on messages of one type."""
+    """The limits of a route for messages of one type."""
 
     def __init__(self, rules: CommandRules, converter: Converter) -> None:
-        """Raises ConversionError for a field that there is not, or that cannot be limited so."""
+        """Raises ConversionError for a field that does not exist, or cannot be limited so."""
         self._converter = converter
         description = converter.description
         self._limits = [
@@ -87,7 +86,8 @@ class FieldLimits:
         ]
 
     def apply(self, cdr: bytes) -> tuple[bytes, bool]:
-        """The message within the limits, and whether that is another; raises ConversionError."""
+        """Apply the limits; returns the message and whether it has changed. Raises
+        ConversionError."""
         value = self._converter.to_dict(cdr)
         has_changed = False
         for limit in self._limits:
@@ -102,7 +102,8 @@ def _compile(
     whole: str,
     make: Callable[[Primitive | String | WideString], Limit],
 ) -> Callable[[Any, str], bool]:
-    """A function that limits what is under `names` in a value, in place; True for a change."""
+    """A function that limits the field `names` of a value in place, and returns whether it has
+    changed."""
     if isinstance(type_, (Array, Sequence)) and isinstance(type_.item, TypeDescription):
         inside = _compile(type_.item, names, key, whole, make)
 
@@ -170,13 +171,13 @@ def _clamp(low: float, high: float) -> Callable[[Primitive | String | WideString
 
 
 def _inside(type_: Primitive, bound: float, *, upwards: bool) -> float:
-    """The bound itself, or the next number of the type that does not reach over it."""
+    """The bound, or the next number of the type that is within it."""
     if type_.size == 8:
         return bound
     code = f"<{type_.code}"
     try:
         (nearest,) = struct.unpack(code, struct.pack(code, bound))
-    except OverflowError:  # more than any number of the type
+    except OverflowError:  # larger than any number of the type
         return bound
     assert isinstance(nearest, float)
     if nearest == bound or (nearest > bound) is upwards:

@@ -261,7 +261,7 @@ class ToRos(Flow):
         properties = message.properties
         if properties is None:
             return convert(message.payload)
-        wanted = self._wanted
+        wanted = self._opened_for
         claimed = user_property(properties, "ros-type")
         if wanted is not None and claimed is not None and claimed != wanted[0]:
             problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
@@ -279,7 +279,7 @@ class ToRos(Flow):
             raise ConversionError(error.path, problem) from None
 
     def _why_not(self) -> str:
-        if self._wanted is not None:
+        if self._opened_for is not None:
             return "its type cannot be bridged"
         if self._count is None:
             return "ROS is not ready"
