@@ -38,10 +38,10 @@ CACHED_IN_ALL = 1 / 8
 #: Pending decisions on one route that a message waits for at a time.
 UNDECIDED = 16
 
-#: The cost to find a route, see `Counters.cost`; each match comes on top, and what the search
-#: passed: so many levels and nodes are one unit of cost.
+#: The cost of looking up a route, see `Counters.cost`; each match adds one unit, and so do
+#: VISITED_PER_COST_UNIT levels and nodes that the search visits.
 ROUTE_COST = 20
-PASSED_PER_COST_UNIT = 4
+VISITED_PER_COST_UNIT = 4
 
 _ALLOWED = Decision(True, "the appliance itself")
 _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
@@ -188,7 +188,7 @@ class Router:
 
     def _match(self, topic: str) -> list[tuple[Session, Subscription] | Share]:
         found = self._subscriptions.match(topic)
-        self._counters.cost += len(found) + self._subscriptions.passed // PASSED_PER_COST_UNIT
+        self._counters.cost += len(found) + self._subscriptions.visited // VISITED_PER_COST_UNIT
         return found
 
     def _may_publish(self, session: Session, topic: str) -> Decision:

@@ -1,4 +1,4 @@
-"""`$SYS`: the broker's own figures under mosquitto's names, which tools know."""
+"""`$SYS`: the broker's metrics under mosquitto's topic names, which tools know."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _WINDOWS = (1, 5, 15)
 
 
 class LoadAverage:
-    """Moving averages a minute of a growing counter, over 1, 5 and 15 minutes, as `uptime` does."""
+    """Moving averages of a counter's rate per minute, over 1, 5 and 15 minutes, as in `uptime`."""
 
     def __init__(self) -> None:
         self._last = 0
         self._averages = [0.0] * len(_WINDOWS)
 
     def update(self, value: int, seconds: float) -> None:
-        """Take in the counter's value, `seconds` after the last one."""
+        """Add the counter's value, `seconds` after the previous one."""
         rate = (value - self._last) * 60 / seconds
         self._last = value
         for index, minutes in enumerate(_WINDOWS):
@@ -36,10 +36,10 @@ class LoadAverage:
 
 
 class SysTopics:
-    """Makes the values; `update` gives those that have changed since it was last asked."""
+    """Computes the values; `update` returns those that have changed since its last call."""
 
     def __init__(self, broker: Broker, version: str, heap: Callable[[], int]) -> None:
-        """`heap` says how many bytes of memory the process has."""
+        """`heap` returns the memory of the process, in bytes."""
         self._broker = broker
         self._heap = heap
         self._version = version
@@ -49,7 +49,7 @@ class SysTopics:
         self._sent: dict[str, str] = {}
 
     def update(self) -> list[tuple[str, bytes]]:
-        """Topics and payloads that have changed, at the broker's time."""
+        """The topics whose payloads have changed since the last call, with these."""
         changed = []
         for name, value in self._values().items():
             if self._sent.get(name) != value:

@@ -1,8 +1,8 @@
-"""The data types of MQTT (section 1.5), the property table (5.0 section 2.2.2.2) and what all
-packets share.
+"""The data types of MQTT (section 1.5), the property table (5.0 section 2.2.2.2) and helpers of
+all packets.
 
-`encode_x` returns bytes and raises ValueError for what cannot be put on the wire. `decode_x`
-reads at an index and returns the value and the index after it; it raises ProtocolError.
+`encode_x` returns bytes, and raises ValueError for a value that cannot be encoded. `decode_x` reads
+at an index, and returns the value and the index behind it; it raises ProtocolError.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
 V31: Final = 3
-"""The protocol level of MQTT 3.1. Only CONNECT has it: a connection of it is one of 3.1.1."""
+"""The protocol level of MQTT 3.1, in CONNECT only: the connection is treated as one of 3.1.1."""
 
 V311: Final = 4
 """The protocol level of MQTT 3.1.1."""
@@ -25,7 +25,7 @@ V5: Final = 5
 """The protocol version of MQTT 5.0."""
 
 VERSION_NAMES: Final = {V31: "3.1", V311: "3.1.1", V5: "5"}
-"""What people call them."""
+"""The names of the versions, for logs."""
 
 MAX_VARINT: Final = 268_435_455
 """The greatest Variable Byte Integer, and so Remaining Length: four bytes of 7 bits."""
@@ -97,7 +97,7 @@ list of int, also when there is one; intervals are in seconds. No properties at 
 
 
 class Kind(Enum):
-    """How a property's value stands on the wire."""
+    """The encoding of a property's value."""
 
     BYTE = 1
     TWO_BYTE = 2
@@ -108,23 +108,24 @@ class Kind(Enum):
     STRING_PAIR = 8
 
 
-#: User Properties of one packet, where no limit is set. Decoded, each is an object many times its
-#: size on the wire.
+#: The default limit of User Properties in one packet. Decoded, each takes many times its encoded
+#: size.
 MAXIMUM_PAIRS: Final = 10_000
 
 
-_USER_PROPERTY: Final = 0x26  # a plain number, as it is compared with each byte
+_USER_PROPERTY: Final = 0x26  # a plain number, because it is compared with each byte
 
 NO_PROPERTIES: Final = b"\0"
-"""How no properties stand on the wire: v5 [MQTT-2.2.2-1]."""
+"""The encoding of no properties: v5 [MQTT-2.2.2-1]."""
 
 
 @dataclass(frozen=True, slots=True)
 class PropertyRule:
-    """What the standard allows of one property.
+    """The standard's rule for one property.
 
-    `owners` are the packet types (and WILL) that may hold it, `repeatable` those that may hold it
-    more than once; a number is from `minimum` to `maximum`, else the error is `out_of_range`.
+    `owners` are the packet types (and WILL) that may contain it, `repeatable` those that may
+    contain it more than once; a number must be from `minimum` to `maximum`, else the error is
+    `out_of_range`.
     """
 
     kind: Kind
@@ -190,18 +191,18 @@ PROPERTY_RULES: Final[dict[Property, PropertyRule]] = {
 }
 """All 27 properties of table 2-4."""
 
-# By identifier, because making a Property of an int is slow: this is on the way of every PUBLISH
-# that has properties.
+# By identifier, because converting an int to a Property is slow, and every PUBLISH with properties
+# needs it.
 _KNOWN: Final = {int(identifier): (identifier, rule) for identifier, rule in PROPERTY_RULES.items()}
 
 
 def malformed(message: str) -> ProtocolError:
-    """The error for bytes that cannot be read (5.0 section 4.13)."""
+    """The error for bytes that cannot be parsed (5.0 section 4.13)."""
     return ProtocolError(ReasonCode.MALFORMED_PACKET, message)
 
 
 def protocol_error(message: str) -> ProtocolError:
-    """The error for what can be read but is against the rules (5.0 section 4.13)."""
+    """The error for a valid encoding that violates a rule (5.0 section 4.13)."""
     return ProtocolError(ReasonCode.PROTOCOL_ERROR, message)
 
 
@@ -271,7 +272,7 @@ def _encode_uint(value: int, size: int) -> bytes:
 
 
 def text_size(text: str) -> int:
-    """Bytes of memory that a string takes: up to four a character, where one is beyond the BMP."""
+    """Bytes of memory of a string: up to four per character if one is beyond the BMP."""
     return sys.getsizeof(text)
 
 
@@ -360,7 +361,7 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
     if pos == stop:
         return None, pos
     properties: Properties = {}
-    buf = buf[:stop]  # a value that is cut off is not completed by what comes behind
+    buf = buf[:stop]  # so that a truncated value is not completed by later bytes
     count = 0
     while pos < stop:
         identifier, rule = _legal_property(buf[pos], owner, properties)
@@ -379,11 +380,11 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
 
 @dataclass(slots=True)
 class CheckedProperties:
-    """The properties of a message as they came, all of them valid.
+    """The validated properties of a received message.
 
-    `passed_on` is what receivers get, in the publisher's order and with its length in front: all
-    but what belongs to one connection, or is counted down. `values` are all but the User
-    Properties, which nobody has looked at: there are so many `pairs` of them.
+    `passed_on` are the encoded properties for the receivers, in the publisher's order and with
+    their length in front: all but those of one connection and the expiry interval. `values` are
+    all but the User Properties, which are not decoded; `pairs` is the number of these.
     """
 
     values: Properties
@@ -391,7 +392,7 @@ class CheckedProperties:
     pairs: int
 
 
-#: What is of one connection, or is counted down, and so is not passed on as it came.
+#: Properties of one connection, and intervals that change with time: not forwarded unchanged.
 _NOT_PASSED_ON: Final = frozenset(
     {
         Property.TOPIC_ALIAS,
@@ -405,23 +406,23 @@ _NOT_PASSED_ON: Final = frozenset(
 def check_properties(
     buf: bytes, pos: int, end: int, owner: int, pairs: int
 ) -> tuple[CheckedProperties | None, int]:
-    """`decode_properties` for who passes them on: the same errors, and no User Property decoded.
+    """Like `decode_properties`, with the same errors, but without decoding User Properties.
 
-    More than so many `pairs`, User Properties, are over a limit of ours: Quota exceeded.
+    More than `pairs` User Properties exceed a limit of this server: Quota exceeded.
     """
     begin = pos
     stop, pos = _property_section(buf, pos, end)
     if pos == stop:
         return None, pos
-    taken = pos  # up to here they are in `kept`, or left out
+    taken = pos  # properties before this index are in `kept`, or left out
     values: Properties = {}
     kept: list[bytes] = []
-    buf = buf[:stop]  # a value that is cut off is not completed by what comes behind
+    buf = buf[:stop]  # so that a truncated value is not completed by later bytes
     count = 0
     while pos < stop:
         if buf[pos] == _USER_PROPERTY:
             count += 1
-            if count > pairs:  # before it is looked at
+            if count > pairs:  # before it is checked
                 raise _too_many_pairs(pairs)
             pos = _check_string(buf, _check_string(buf, pos + 1, stop), stop)
             continue
@@ -459,7 +460,7 @@ def _property_section(buf: bytes, pos: int, end: int) -> tuple[int, int]:
 def _legal_property(
     identifier: int, owner: int, properties: Properties
 ) -> tuple[Property, PropertyRule]:
-    """What may come behind `properties` in that packet, and its rule."""
+    """The property of that identifier and its rule, if it may follow `properties` in the packet."""
     # An identifier is a Variable Byte Integer; no known one needs a second byte.
     known = _KNOWN.get(identifier)
     if known is None:
@@ -473,7 +474,7 @@ def _legal_property(
 
 
 def _too_many_pairs(limit: int) -> ProtocolError:
-    """The error for more User Properties than that.
+    """The error for more User Properties than the limit.
 
     0x97 is there for "an implementation or administrative imposed limit", in CONNACK as in
     DISCONNECT (5.0 sections 3.2.2.2 and 3.14.2.1).
@@ -482,7 +483,7 @@ def _too_many_pairs(limit: int) -> ProtocolError:
 
 
 def _check_string(buf: bytes, pos: int, stop: int) -> int:
-    """Refuses what `decode_string` would refuse; returns the index after the string."""
+    """Raises the errors of `decode_string`; returns the index behind the string."""
     start = pos + 2
     if start > stop:
         raise malformed("the packet ends inside a Two Byte Integer")
@@ -500,7 +501,7 @@ def _check_string(buf: bytes, pos: int, stop: int) -> int:
 def _decode_property(
     buf: bytes, pos: int, identifier: Property, rule: PropertyRule, properties: Properties
 ) -> int:
-    """Reads one value at `pos`, no User Property, into `properties`; returns the index after it."""
+    """Decodes one value, not of a User Property, into `properties`; returns the index behind it."""
     kind = rule.kind
     if kind is Kind.STRING:
         text, pos = decode_string(buf, pos)

@@ -1,7 +1,7 @@
-"""Topic names and filters (section 4.7 of both standards): the one validator, matcher and trees.
+"""Topic names and filters (section 4.7 of both standards): validation, matching and search trees.
 
-A topic is split at `/` into levels, an empty level is a level like any other. In a filter `+`
-stands for one level and a final `#` for the level above it and everything below.
+A topic is split at `/` into levels; an empty level is a level like any other. In a filter, `+`
+matches one level, and a final `#` matches the level above it and everything below.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ from typing import Final, Generic, TypeVar
 V = TypeVar("V")
 
 MAX_TOPIC: Final = 65_535
-"""The greatest length, in bytes, of a topic or a filter: what a string of MQTT can hold."""
+"""The maximum length, in bytes, of a topic or a filter: that of an MQTT string."""
 
 _SHARE: Final = "$share/"
 
 STEP: Final = 16
-"""Nodes of a tree that are passed in one step of a search."""
+"""Nodes of a tree that are visited in one step of a search."""
 
 
 # Control characters and non-characters: the standard leaves them to the receiver (section 1.5.3;
-# 5.0 section 1.5.4). A name that cannot be printed is of no use, and a trap for who reads a log.
+# 5.0 section 1.5.4). A name that cannot be printed is useless, and misleading in a log.
 _CONTROL: Final = re.compile("[\x01-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff]")
 
 
 def holds_control(text: str) -> bool:
-    """Whether the text holds characters that no name may have here."""
+    """Whether the text contains characters that are not allowed in names here."""
     return _CONTROL.search(text) is not None
 
 
 def check_topic(topic: str) -> None:
-    """Raises a ValueError that says why `topic` is no topic name (section 4.7)."""
+    """Raises a ValueError with the reason if `topic` is not a valid topic name (section 4.7)."""
     _check_string(topic, "topic")
     if "+" in topic or "#" in topic:  # [MQTT-3.3.2-2] [MQTT-4.7.1-1] v5 [MQTT-4.7.0-1]
         raise ValueError("a topic must not hold + or #")
 
 
 def check_filter(filter: str) -> None:
-    """Raises a ValueError that says why `filter` is no topic filter (section 4.7).
+    """Raises a ValueError with the reason if `filter` is not a valid topic filter (section 4.7).
 
-    For a shared subscription call `parse_shared` first: `$share/…` is not looked into here.
+    For a shared subscription call `parse_shared` first: `$share/…` is not parsed here.
     """
     _check_string(filter, "topic filter")
     if "+" not in filter and "#" not in filter:
@@ -70,7 +70,7 @@ def _check_string(text: str, what: str) -> None:
 def parse_shared(filter: str) -> tuple[str, str] | None:
     """The group and the filter of `$share/{group}/{filter}`; None for any other filter.
 
-    ValueError when it is a shared subscription that is not valid (5.0 section 4.8.2).
+    Raises a ValueError if it is an invalid shared subscription (5.0 section 4.8.2).
     """
     if not filter.startswith(_SHARE):
         return None
@@ -121,10 +121,10 @@ def _dollar_apart(wild: str, other: str) -> bool:
 
 
 def _shape(filter: str) -> tuple[list[str], bool]:
-    """A filter as the levels that a topic must at least have, and whether it may have more.
+    """The levels that a matching topic must have at least, and whether it may have more.
 
-    A topic is never empty, so `#` asks for one level, and `/#` (whose parent is the empty topic)
-    for two: `+/#` and `#` match the same topics, and so do `/#` and `/+/#`.
+    A topic is never empty, so `#` requires one level, and `/#` (whose parent is the empty topic)
+    requires two: `+/#` and `#` match the same topics, and so do `/#` and `/+/#`.
     """
     levels = filter.split("/")
     if levels[-1] != "#":
@@ -144,21 +144,21 @@ class _FilterNode(Generic[V]):
 
 
 class SubscriptionTree(Generic[V]):
-    """Filters, each with values by key, found by a topic: a trie whose edges are levels.
+    """Maps filters to values by key, and finds the values for a topic: a trie with levels as edges.
 
-    Looking a topic up visits the nodes that match a beginning of it, each once. Of filters with
-    `+` these may be many, also when none of them matches in the end: `passed` says how many they
-    were. Filters and topics are valid ones.
+    A lookup visits each node that matches a prefix of the topic, once. With filters that contain
+    `+` these may be many, even if none matches in the end; `visited` is their number. Filters and
+    topics must be valid.
     """
 
     def __init__(self) -> None:
         self._root: _FilterNode[V] = _FilterNode()
         self._size = 0
-        #: What the last `match` looked at: levels of the topic, and nodes.
-        self.passed = 0
+        #: The levels and nodes that the last `match` visited.
+        self.visited = 0
 
     def __len__(self) -> int:
-        """How many pairs of filter and key there are."""
+        """The number of pairs of filter and key."""
         return self._size
 
     def add(self, filter: str, key: Hashable, value: V) -> bool:
@@ -194,17 +194,17 @@ class SubscriptionTree(Generic[V]):
         return True
 
     def match(self, topic: str) -> list[V]:
-        """The values of all filters that match `topic`; a key with two such filters is in twice."""
+        """The values of all filters that match `topic`; a key with two of them occurs twice."""
         found: list[V] = []
-        # The nodes reached so far. A node has one parent, so none can be reached twice.
+        # The nodes reached so far; each has one parent, so none is reached twice.
         nodes = [self._root]
         wild = topic[:1] != "$"  # [MQTT-4.7.2-1]: no wildcard for the first level of a $ topic.
         levels = topic.split("/")
-        passed = len(levels)
+        visited = len(levels)
         for level in levels:
             reached: list[_FilterNode[V]] = []
             for node in nodes:
-                passed += 1
+                visited += 1
                 children = node.children
                 child = children.get(level)
                 if child is not None:
@@ -220,7 +220,7 @@ class SubscriptionTree(Generic[V]):
             if not nodes:
                 break
             wild = True
-        self.passed = passed + len(nodes)
+        self.visited = visited + len(nodes)
         for node in nodes:
             found.extend(node.values.values())
             child = node.children.get("#")  # `a/#` matches `a` too.
@@ -242,9 +242,9 @@ class _TopicNode(Generic[V]):
 
 
 class TopicTree(Generic[V]):
-    """Topics, each with one value, found by a filter: what retained messages need.
+    """Maps topics to one value each, and finds those that match a filter: for retained messages.
 
-    Topics and filters are valid ones.
+    Topics and filters must be valid.
     """
 
     def __init__(self) -> None:
@@ -252,7 +252,7 @@ class TopicTree(Generic[V]):
         self._size = 0
 
     def __len__(self) -> int:
-        """How many topics have a value."""
+        """The number of topics with a value."""
         return self._size
 
     def set(self, topic: str, value: V) -> None:
@@ -278,7 +278,7 @@ class TopicTree(Generic[V]):
         return node.entry[1] if node.entry is not None else None
 
     def delete(self, topic: str) -> bool:
-        """Forgets `topic`; returns whether it had a value."""
+        """Deletes the value of `topic`; returns whether it had one."""
         path: list[tuple[_TopicNode[V], str]] = []
         node = self._root
         for level in topic.split("/"):
@@ -298,29 +298,29 @@ class TopicTree(Generic[V]):
         return True
 
     def find(self, filter: str) -> Iterator[tuple[str, V]]:
-        """The topics that match `filter` with their values, one at a time as they are asked for.
+        """Yields the topics that match `filter` with their values.
 
-        The tree may change between two of them; it is then open whether what was set or deleted
-        meanwhile is in the rest.
+        The tree may change during the iteration; whether the rest contains topics that were set or
+        deleted meanwhile is then undefined.
         """
         for found in self.find_in_steps(filter):
             if found is not None:
                 yield found
 
     def find_in_steps(self, filter: str) -> Iterator[tuple[str, V] | None]:
-        """`find`, with a None now and then, so that a long search can be put off in its middle."""
+        """Like `find`, but yields None now and then, so that a long search can be suspended."""
         levels = filter.split("/")
-        # What is still to be looked at: nodes, and how many levels of the filter lead to them.
+        # The nodes to be visited, and the number of filter levels that lead to them.
         stack: list[tuple[Iterator[_TopicNode[V]], int]] = [(iter((self._root,)), 0)]
-        passed = 0
+        visited = 0
         while stack:
             nodes, depth = stack[-1]
             node = next(nodes, None)
             if node is None:
                 stack.pop()
                 continue
-            passed += 1
-            if not passed % STEP:
+            visited += 1
+            if not visited % STEP:
                 yield None
             if depth == len(levels):
                 if node.entry is not None:
@@ -339,7 +339,7 @@ class TopicTree(Generic[V]):
                     stack.append((iter((child,)), depth + 1))
 
     def _listing(self, node: _TopicNode[V]) -> tuple[_TopicNode[V], ...]:
-        """What wildcards find below a node; kept, as thousands of searches may be under way."""
+        """The children that wildcards match, cached: thousands of searches may be in progress."""
         if node.listing is None:
             hides_dollar = node is self._root  # [MQTT-4.7.2-1]
             node.listing = tuple(

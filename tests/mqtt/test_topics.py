@@ -375,8 +375,8 @@ def test_a_search_says_what_it_passed_also_when_nothing_matches():
     for number, levels in enumerate(product("a+", repeat=8)):
         tree.add("/".join([*levels, "end"]), 1, number)
     assert tree.match("/".join(["a"] * 8 + ["other"])) == []
-    assert tree.passed == 9 + 2**9 - 1  # the topic's levels, and all nodes above the last ones
+    assert tree.visited == 9 + 2**9 - 1  # the topic's levels, and all nodes above the last ones
     assert tree.match("other") == []
-    assert tree.passed == 1 + 1 + 1  # the root, and its +
+    assert tree.visited == 1 + 1 + 1  # the root, and its +
     assert tree.match("$other") == []
-    assert tree.passed == 1 + 1
+    assert tree.visited == 1 + 1
