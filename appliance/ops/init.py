@@ -1,4 +1,4 @@
-"""`appliance init`: everything a new appliance needs, and nothing over what is there already."""
+"""`appliance init`: creates everything that a new appliance needs, and replaces no file."""
 
 from __future__ import annotations
 
@@ -76,18 +76,18 @@ NO_CALLS = """\
 #topic write {robot}/controller/_param/+/set/#
 """
 
-#: Parts of a name that `**` in a pattern stands for in the access rules, which have nothing like it
-#: but `#`, and that would allow what is no call.
+#: The most levels that the access rules allow for `**` in a pattern, one line for each number. The
+#: rules' only wildcard for several levels is `#`, which would also allow what is no call.
 _DEPTH = 3
 
 
 class InitError(Exception):
-    """Something could not be made; the message says what and what to do."""
+    """Something could not be created; the message says what, and what to do."""
 
 
 @dataclass(frozen=True)
 class InitStep:
-    """One file: whether it was made now or kept as it was, and what to know about it."""
+    """One file: whether it was created now or existed before, and what it is."""
 
     path: Path
     made: bool
@@ -96,20 +96,20 @@ class InitStep:
 
 @dataclass(frozen=True)
 class Credentials:
-    """The first user, with the password that is shown this once."""
+    """The first user, with the password, which is shown only once."""
 
     user: str
     password: str
 
 
 def robot_name(text: str) -> str:
-    """The nearest name that may be one level of a topic: `r2 d2!` becomes `r2-d2`."""
+    """The text as a name that is valid as one topic level: `r2 d2!` becomes `r2-d2`."""
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip("-_.")[:64].rstrip("-_.")
     return name or "robot"
 
 
 def generate_password() -> str:
-    """A random password of letters and digits, which no shell and no URL misreads."""
+    """A random password of letters and digits, which need no quoting in shells and URLs."""
     alphabet = string.ascii_letters + string.digits
     return "".join(secrets.choice(alphabet) for _ in range(_PASSWORD_LENGTH))
 
@@ -123,13 +123,13 @@ def initialise(
     configuration: str = CONFIGURATION,
     names: Sequence[str] = (),
 ) -> Iterator[InitStep | Credentials]:
-    """Makes what is missing in `directory`, telling each step as it is done.
+    """Create what is missing in `directory`, and yield each step when it is done.
 
-    `configuration` is the text of appliance.yaml, with `{robot}` in it, where there is none;
-    `names` are DNS names for the server's certificate beside those that this computer knows.
+    `configuration` is the text for a missing appliance.yaml, with `{robot}` in it; `names` are DNS
+    names for the server's certificate, in addition to those that this computer knows.
 
     Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
-    made until then is good and stays.
+    created until then is complete and stays.
     """
     try:
         check_username(user)
@@ -148,13 +148,13 @@ def initialise(
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     made = _write_new(settings.broker.acl, ACCESS.format(user=user, calls=calls or NO_CALLS))
     yield InitStep(settings.broker.acl, made, "access rules")
-    # Last, so that the password is the last thing shown.
+    # The users come last, so that the password is the last thing shown.
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
 
 
 def call_topics(bridge: config.BridgeSection) -> list[str]:
-    """The filters, in an ACL file's words, of all that is called on what is bridged, and of nothing
-    else: one's own goals are cancelled, and answers are read with the rest of the robot."""
+    """The topic filters, in the ACL file's syntax, for calls of what is bridged, and for nothing
+    else. Clients cancel only their own goals, and read answers with the rest of the robot."""
     found: list[str] = []
     for service in bridge.services:
         if service.to == "ros":
@@ -171,20 +171,20 @@ def call_topics(bridge: config.BridgeSection) -> list[str]:
 
 
 def _below(template: str, filters: list[str], *calls: str) -> list[str]:
-    """Each of the calls of each, with the token behind it that 3.1.1 has."""
+    """Filters for each call below each name, and for the token that MQTT 3.1.1 clients append."""
     bases = [template.replace("{ros}", one).replace("{node}", one) for one in filters]
     return [f"{base}/{call}/#" for base in bases for call in calls]
 
 
 def _filters(names: Iterable[str]) -> list[str]:
-    """What of ROS names and patterns may be called, as filters: a part with a `*` is a `+`."""
+    """ROS names and patterns as topic filters: a part with a `*` becomes a `+`."""
     found: list[str] = []
     for name in names:
         if name.startswith("!"):
             continue
         before, deep, after = name.partition("**")
         depths = range(1, _DEPTH + 1) if deep else [0]
-        # "/arm/**" is all below /arm; before and after may have the beginning and end of a part.
+        # "/arm/**" is everything below /arm; `before` and `after` may end or begin within a part.
         middles = ["*" + "/*" * (depth - 1) if depth else "" for depth in depths]
         found += ["/".join(map(_filter, f"{before}{m}{after}".split("/"))) for m in middles]
     return found
@@ -236,7 +236,7 @@ def _users(
     password = generate_password()
     users = Passwords(path)
     users.set(user, password)
-    if password_file is not None:  # before the users file, or an interruption would lose it
+    if password_file is not None:  # before the users file: an interruption must not lose it
         password_file.unlink(missing_ok=True)
         _write_new(password_file, password + "\n", mode=0o600)
     users.save()
@@ -247,18 +247,20 @@ def _users(
 
 
 def _write_new(path: Path, text: str, mode: int = 0o644) -> bool:
-    """Writes the file, safe on disk, unless it is there; returns whether it was written."""
+    """Write the file and sync it, unless it exists; returns whether it was written."""
     if path.exists():
         return False
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Whole or not at all: half a file of an interrupted run would be kept by the next one.
+    # Whole or not at all: the next run would not replace half a file of an interrupted one.
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with os.fdopen(os.open(draft, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode), "w") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        os.link(draft, path)  # unlike a rename, this never replaces what came meanwhile
+        os.link(
+            draft, path
+        )  # unlike a rename, this never replaces a file that was created meanwhile
     except FileExistsError:
         return False
     finally:

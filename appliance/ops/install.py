@@ -22,7 +22,7 @@ from appliance.ops.init import CONFIGURATION as CONFIGURATION_TEXT
 from appliance.ops.init import Credentials, InitStep, initialise, robot_name
 from appliance.ops.unit import CONFIGURATION, DATA, ENVIRONMENT, NAME, OWN_USER, VARIABLES, Unit
 
-#: Where the single file goes, and an administrator's own units; and those of a package.
+#: The paths of the single file and of an administrator's unit, and those of the Debian package.
 COMMAND = Path("/usr/local/bin/appliance")
 UNIT_FILE = Path("/etc/systemd/system", NAME)
 PACKAGED_COMMAND = Path("/usr/bin/appliance")
@@ -34,7 +34,7 @@ _LOCK = Path("/run/appliance-install.lock")
 #: Seconds for systemd to start the service, which may have a large store to read, and to stop it.
 PATIENCE = 330.0
 
-#: What a shell with a sourced ROS says about it that the service should know, too.
+#: Variables of a shell with a sourced ROS that the service should have as well.
 _TAKEN_OVER = (
     "ROS_DOMAIN_ID",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
@@ -49,19 +49,19 @@ control: /run/appliance/control.sock
 crash_reports: {DATA}/crashes
 """
 
-#: How the unit of a single file is told from others.
+#: The line by which the unit of a single file is recognised.
 _SINGLE_FILE = "NotifyAccess=all"
 
 Verb = Literal["made", "replaced", "kept", "removed", "done"]
 
 
 class InstallError(Exception):
-    """It cannot be done; the text says why and what to do."""
+    """The installation is not possible; the text says why, and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class InstallStep:
-    """One thing, done or, with `dry_run`, to be done."""
+    """One change that was made or, with `dry_run`, would be made."""
 
     verb: Verb
     subject: str
@@ -76,12 +76,12 @@ class _Account(NamedTuple):
 
 @dataclass
 class ServiceInstaller:
-    """An appliance as a service below `root`.
+    """Installs the appliance as a service below `root`, and removes it.
 
-    `source` is the single file that is to be the command; without one it is `command`, which stays
-    where it is. The user is the one that the service had before, or its own. With `packaged` the
-    command and the unit are a package's own, and it alone starts the service. `environment` is what
-    a sourced ROS is taken from.
+    `source` is the single file to install as the command; without it the command is `command`,
+    which stays where it is. The default user is the one of an earlier installation, or the
+    service's own. With `packaged` the command and the unit belong to the Debian package, which
+    alone starts the service. `environment` has the variables of a sourced ROS.
     """
 
     command: Path
@@ -101,7 +101,7 @@ class ServiceInstaller:
         self.user = self.user or self._user_before() or OWN_USER
 
     def install(self) -> Iterator[InstallStep | Credentials]:
-        """Puts everything in place, or the newer version in that of the older one.
+        """Install everything, or replace the older version by this one.
 
         Raises:
             InstallError: something is in the way.
@@ -114,7 +114,7 @@ class ServiceInstaller:
         with self._alone():
             try:
                 yield from self._install()
-            except BaseException:  # also Ctrl-C, and nobody who reads what is said any more
+            except BaseException:  # including Ctrl-C and a closed standard output
                 self._put_back()
                 raise
             finally:
@@ -123,7 +123,7 @@ class ServiceInstaller:
                         _before(self._at(path)).unlink(missing_ok=True)
 
     def uninstall(self, *, purge: bool = False) -> Iterator[InstallStep]:
-        """Takes the service and the command away; with `purge` what they have written as well.
+        """Remove the service and the command; with `purge` also what they have written.
 
         Raises:
             InstallError: something is in the way.
@@ -174,7 +174,7 @@ class ServiceInstaller:
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
-        """Two at once would write the same files."""
+        """Lock against a second installation, which would write the same files."""
         if self.dry_run:
             yield
             return
@@ -185,7 +185,8 @@ class ServiceInstaller:
         try:
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # One that has just ended has removed it, and a third may have made its own.
+                # An installation that has just ended has removed this file, and a third may have
+                # created its own.
                 is_alone = os.fstat(descriptor).st_nlink > 0
             if not is_alone:
                 raise InstallError("another `appliance install` is at work; wait for its end")
@@ -195,13 +196,13 @@ class ServiceInstaller:
             os.close(descriptor)
 
     def _put_back(self) -> None:
-        """Let the files be as they were."""
+        """Restore the files of the earlier installation."""
         for undo in reversed(self._undo):
             undo()
         self._undo.clear()
 
     def _user_before(self) -> str:
-        """Whom the service runs as by its unit and what `systemctl edit` adds to it."""
+        """The user in the unit of an earlier installation, or in its drop-ins."""
         unit = self._at(UNIT_FILE)
         files = [] if self.packaged else [unit]
         files += sorted(unit.with_name(f"{unit.name}.d").glob("*.conf"))
@@ -214,7 +215,7 @@ class ServiceInstaller:
         return user
 
     def _put_before(self) -> list[Path]:
-        """What an installation has put in place; a command that was there already is not in it."""
+        """The files of an earlier installation, without a command that was not installed by it."""
         found = []
         with contextlib.suppress(OSError):
             unit = self._at(UNIT_FILE).read_text()
@@ -222,11 +223,11 @@ class ServiceInstaller:
         found = [_ENABLED, *found, UNIT_FILE]
         return [path for path in found if self._at(path).is_symlink() or self._at(path).exists()]
 
-    # What is checked before anything is changed
+    # --- checks before anything is changed -----------------------------------------------------
 
     @property
     def _lives_here(self) -> bool:
-        """Whether it is for the system that runs, and systemd runs that."""
+        """Whether the target is the running system, and systemd runs it."""
         return self.root == Path("/") and Path("/run/systemd/system").is_dir()
 
     @property
@@ -266,7 +267,7 @@ class ServiceInstaller:
             )
 
     def _try_as(self, account: _Account) -> None:
-        """Have the service's user run the command, before systemd fails at it over and over."""
+        """Run the command as the service's user, before systemd fails to do so again and again."""
         try:
             tried = subprocess.run(
                 [self._command, "--version"],
@@ -280,8 +281,8 @@ class ServiceInstaller:
                 timeout=60,
                 check=False,
             )
-            said = tried.stderr.strip().rpartition("\n")[2] or f"exit code {tried.returncode}"
-            reason = said if tried.returncode else ""
+            output = tried.stderr.strip().rpartition("\n")[2] or f"exit code {tried.returncode}"
+            reason = output if tried.returncode else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             reason = str(error)
         if reason:
@@ -290,8 +291,7 @@ class ServiceInstaller:
                 "appliance where everyone may read it, such as in /opt, or name another user"
             )
 
-    # The parts
-
+    # --- the parts -----------------------------------------------------------------------------
     @property
     def _command(self) -> Path:
         if self.packaged:
@@ -300,7 +300,7 @@ class ServiceInstaller:
 
     def _install_command(self) -> Iterator[InstallStep]:
         if self.packaged:
-            # What was installed by hand before would stand in the way of the package's.
+            # A unit that was installed by hand would override the package's.
             by_hand = self._at(UNIT_FILE)
             if by_hand.is_file() and not by_hand.is_symlink():  # a link would be a mask
                 for path in self._put_before():
@@ -319,7 +319,7 @@ class ServiceInstaller:
         yield self._step(verb, str(COMMAND), "the command", put)
 
     def _account(self) -> _Account | None:
-        """The service's user; None when there is none yet."""
+        """The service's user; None when it does not exist yet."""
         if self.root == Path("/"):
             with contextlib.suppress(KeyError):
                 found = pwd.getpwnam(self.user)
@@ -352,7 +352,7 @@ class ServiceInstaller:
         if not self.initialise:
             return
         if self.dry_run:
-            # Who only wants to see it may not look into the folder.
+            # A user who only wants to see the steps may not be allowed to read the folder.
             is_there = os.access(place, os.X_OK) and (place / "appliance.yaml").exists()
             verb: Verb = "kept" if is_there or self._is_of_another(place) else "made"
             text = "configuration, certificates, first user and access rules; what is there stays"
@@ -375,13 +375,13 @@ class ServiceInstaller:
         _hand_over(place, account, before)
 
     def _is_of_another(self, place: Path) -> bool:
-        """Whether another user than root has it, to whom it was handed over."""
+        """Whether it exists and belongs to another user than root, as an installation leaves it."""
         return place.exists() and place.stat().st_uid != 0
 
     def _configuration_of_another(self, place: Path) -> InstallStep:
-        """That of an earlier installation; root makes nothing where another user is at home.
+        """The step that keeps an earlier installation's folder, in which root creates nothing.
 
-        Where it would be made is for that user to say, by links and by what appliance.yaml names.
+        Its user could have root write elsewhere, by links and by the paths in appliance.yaml.
         """
         file = place / "appliance.yaml"
         if not file.exists():
@@ -430,7 +430,7 @@ class ServiceInstaller:
         )
 
     def unit(self, account: _Account | None = None) -> Unit:
-        """The unit for this computer."""
+        """The systemd unit for this computer."""
         account = account or self._account()
         homes = ("/home", "/root", "/run/user")
         behind = any(
@@ -443,7 +443,7 @@ class ServiceInstaller:
             self.user,
             account.group if account else self.user,
             single_file=self.source is not None,
-            # Where its own programs are a user has its workspaces, too.
+            # A user's own ROS workspaces are in its home, as its programs are.
             behind_home=behind or self.user != OWN_USER,
             systemd=systemd_version(),
         )
@@ -479,7 +479,7 @@ class ServiceInstaller:
         except (InstallError, KeyboardInterrupt) as error:
             if not self._undo:
                 raise
-            # systemd may be about to start the newer one, which Ctrl-C does not end.
+            # systemd may still be starting the newer version, which Ctrl-C does not end.
             self._put_back()
             self._systemctl("daemon-reload")
             self._systemctl("restart", NAME)
@@ -490,15 +490,14 @@ class ServiceInstaller:
     def _disable(self) -> None:
         self._systemctl("disable", "--now", NAME)
 
-    # How
-
+    # --- how -----------------------------------------------------------------------------------
     def _step(self, verb: Verb, subject: str, text: str, do: Callable[[], object]) -> InstallStep:
         if not self.dry_run:
             do()
         return InstallStep(verb, subject, text)
 
     def _put(self, path: Path, content: Path | str, mode: int) -> None:
-        """The file with that content, or as it was before: never half of it, also after a crash."""
+        """Write the file whole or leave it as it was, even in a crash."""
         place = self._at(path)
         place.parent.mkdir(parents=True, exist_ok=True)
         draft = place.with_name(f".{place.name}.new")
@@ -543,14 +542,14 @@ class ServiceInstaller:
         except subprocess.TimeoutExpired:
             raise InstallError(f"`{' '.join(command)}` does not end{hint}") from None
         if ended.returncode:
-            said = (ended.stderr or ended.stdout).strip() or f"exit code {ended.returncode}"
-            raise InstallError(f"`{' '.join(command)}` failed: {said}{hint}")
+            output = (ended.stderr or ended.stdout).strip() or f"exit code {ended.returncode}"
+            raise InstallError(f"`{' '.join(command)}` failed: {output}{hint}")
 
 
 def systemd_version() -> int:
     """The release of this computer's systemd, 0 when there is none."""
     try:
-        said = subprocess.run(
+        output = subprocess.run(
             ["systemctl", "--version"],
             env=for_other_programs(),
             capture_output=True,
@@ -559,7 +558,7 @@ def systemd_version() -> int:
         ).stdout
     except OSError:
         return 0
-    words = said.split()
+    words = output.split()
     return int(words[1]) if len(words) > 1 and words[1].isdecimal() else 0
 
 
@@ -576,8 +575,8 @@ def _group(root: Path, gid: int) -> str:
 
 
 def _entries(file: Path, *fields: int) -> Iterator[list[str]]:
-    """Names, and these fields beside them, of what passwd(5) and group(5) have; a line may be
-    empty, or `+` for those of NIS, and comments are in any encoding."""
+    """Names and these fields of the lines of passwd(5) or group(5). A line may be empty or `+` for
+    NIS, and comments may have any encoding."""
     for line in file.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
         parts = line.split(":")
         if len(parts) > max(fields):
@@ -595,9 +594,9 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _hand_over(tree: Path, account: _Account, owner: int) -> None:
-    """Give what `owner` has in there to the service's user; what others have stays theirs."""
-    # By descriptors and never through a link: the service's user may change what is in there now.
-    # The folder itself last: it tells the next installation whether this one was cut off.
+    """Change the owner of the files of `owner` in there to the service's user."""
+    # By descriptors and never through a link, because the service's user can change the folder
+    # meanwhile. The folder itself comes last: its owner says whether this was completed.
     for _, directories, files, descriptor in os.fwalk(tree.resolve(), topdown=False):
         for name in (*directories, *files, "."):
             status = os.stat(name, dir_fd=descriptor, follow_symlinks=False)
@@ -609,7 +608,7 @@ def _remove(place: Path) -> None:
     if place.is_dir() and not place.is_symlink():
         try:
             shutil.rmtree(place)
-        except OSError as error:  # where a disk of its own is mounted only what is on it can go
+        except OSError as error:  # a mount point cannot be removed, only what is in it
             if error.errno != errno.EBUSY or any(place.iterdir()):
                 raise
     else:
