@@ -1,4 +1,4 @@
-"""A broker and a bridge with calls, and MQTT clients of both versions that keep what they get."""
+"""A broker and a bridge with calls, and MQTT clients of both versions that record messages."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class AllTypes:
 
 
 class Rules:
-    """Everything is allowed but what is in `denied`: (user, action, beginning of a topic)."""
+    """Allows everything except `denied`: (user, action, beginning of a topic)."""
 
     def __init__(self):
         self.epoch = 0
@@ -56,7 +56,7 @@ class Rules:
         self.epoch += 1
 
 
-class Client(InsideLink):
+class RecordingClient(InsideLink):
     """An MQTT client; `calls` are answered as MQTT 5 does, `calls_311` by tokens."""
 
     def __init__(self, broker, name, *subscriptions, user=None):
@@ -77,7 +77,7 @@ class Client(InsideLink):
 
     def publish(self, message, qos, packet_id, dup, retain, subscription_ids):
         self.received.append(message)
-        if qos:  # in a turn of its own, as it would come through a network
+        if qos:  # in a later round of the loop, as through a network
             asyncio.get_running_loop().call_soon(self.session.puback, packet_id)
 
     def close(self, reason, message):
@@ -117,8 +117,8 @@ class Client(InsideLink):
 
         await until(found, f"the answer to {topic}")
         (message,) = found()
-        told = dict(message.properties[Property.USER_PROPERTY])
-        return told["status"], json.loads(message.payload)
+        user_properties = dict(message.properties[Property.USER_PROPERTY])
+        return user_properties["status"], json.loads(message.payload)
 
     async def call_311(self, topic, payload=b""):
         """The JSON of the answer, by a token."""
@@ -131,7 +131,7 @@ class Client(InsideLink):
         return self.payloads(reply)[0]
 
     async def error(self, topic, payload=b"", **kw):
-        """(code, message) of a call that has to fail, which both versions have to tell alike."""
+        """(code, message) of a call that must fail."""
         status, answer = await self.call(topic, payload, **kw)
         assert status == "error", answer
         assert set(answer) == {"error"}
@@ -154,7 +154,7 @@ class CallHarness:
         return self.bridge
 
     def client(self, name, *subscriptions, user=None):
-        return Client(self.broker, name, *subscriptions, user=user)
+        return RecordingClient(self.broker, name, *subscriptions, user=user)
 
     def counters(self, index=0):
         return self.bridge.calls.status()[index].counters

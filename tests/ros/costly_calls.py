@@ -1,9 +1,9 @@
 """python tests/ros/costly_calls.py [--seconds 10] [--only NAME …]
 
-Calls and commands that are as much work as a client can make them, from 20 connections at once, and
-a healthy client beside them. Prints what its round trips took, and how many messages were converted
-or refused as too much: the costly part was reached. The exit code is 1 when a round trip took too
-long. Needs rclpy; nothing has to run.
+Sends the most costly calls and commands that a client can make, over 20 connections at once, beside
+a healthy client. Prints the healthy client's round trips, and how many messages were converted or
+rejected as too large, which shows that the costly part was reached. The exit code is 1 when a round
+trip took too long. Needs rclpy; nothing has to run.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ SHAPES = {
 }
 
 
-class Caller(asyncio.Protocol):
+class CostlyClient(asyncio.Protocol):
     """A connection that sends as fast as it is answered."""
 
     def __init__(self, name: str, shape: Shape, payload: bytes, counts: Counter[str]) -> None:
@@ -315,7 +315,7 @@ async def _attack(name: str, target: Target, seconds: float) -> Counter[str]:
     lines = []
     for number in range(CONNECTIONS):
         transport, line = await loop.create_connection(
-            lambda number=number: Caller(f"m{number}", shape, payload, counts),  # type: ignore[misc]
+            lambda number=number: CostlyClient(f"m{number}", shape, payload, counts),  # type: ignore[misc]
             "127.0.0.1",
             target.plain_port,
         )
@@ -357,7 +357,7 @@ class Outcome:
 
 
 @contextlib.contextmanager
-def arena(directory: Path) -> Iterator[Callable[[str, float], Outcome]]:
+def attacked_server(directory: Path) -> Iterator[Callable[[str, float], Outcome]]:
     """An appliance, and the function that attacks it."""
     spawn = multiprocessing.get_context("spawn")
     appliance = ApplianceProcess(
@@ -433,7 +433,7 @@ def main() -> int:
     wanted = arguments.only or ["*"]
     failed = 0
     print(f"{'message':<24} {'p50':>7} {'p99':>7} {'max':>7} ms  what became of them")
-    with tempfile.TemporaryDirectory() as directory, arena(Path(directory)) as attack:
+    with tempfile.TemporaryDirectory() as directory, attacked_server(Path(directory)) as attack:
         for name in SHAPES:
             if not any(fnmatch.fnmatch(name, one) for one in wanted):
                 continue

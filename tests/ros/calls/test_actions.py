@@ -1,4 +1,4 @@
-"""Actions on a FakeNode: what is hard to bring about with a real robot."""
+"""Actions on a FakeNode: cases that are hard to cause with a real robot."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ CONVERTERS = Converters(load_description)
 GOAL, STOP = "r2d2/walk/_goal", "r2d2/walk/_cancel"
 
 
-class Walks:
-    """An action's server, which answers when it is told to."""
+class WalkServer:
+    """An action's server, which answers on demand."""
 
     def __init__(self, harness):
         self.harness = harness
@@ -86,7 +86,7 @@ async def harness():
 
 async def begin(harness, **route):
     harness.start(action("/walk", **route))
-    walks = Walks(harness)
+    walks = WalkServer(harness)
     await asyncio.sleep(0)
     harness.node.spin()
     client = harness.client("alice", "r2d2/walk/_result/+")
@@ -145,7 +145,7 @@ async def test_a_server_that_ends_before_it_could_be_asked_for_the_result(harnes
 
 
 @pytest.mark.parametrize("part", ["send_goal", "get_result", "cancel_goal"])
-async def test_an_action_is_there_when_all_of_it_is(harness, part):
+async def test_an_action_is_available_when_all_its_services_are(harness, part):
     walks, client = await begin(harness)
     (missing,) = (service for service in walks.services if service.name.endswith(part))
     missing.remove()
@@ -157,7 +157,7 @@ async def test_an_action_is_there_when_all_of_it_is(harness, part):
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_again(harness):
+async def test_the_status_is_published_again_when_a_missing_service_of_the_action_is_back(harness):
     walks, _ = await begin(harness)
     said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
     latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
@@ -181,7 +181,7 @@ async def test_what_goals_there_are_is_shown_again_when_the_action_is_whole_agai
 
 
 @pytest.mark.parametrize("is_lost", [True, False], ids=["the bus ends", "the route is removed"])
-async def test_a_status_that_still_waits_is_not_left_behind(harness, is_lost):
+async def test_a_queued_status_is_cleared_with_its_route_or_bus(harness, is_lost):
     await begin(harness)
     said = {"status_list": [{"goal_info": {"goal_id": {"uuid": bytes(range(16))}}, "status": 2}]}
     latched = QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1)
@@ -224,7 +224,7 @@ async def test_ros_ends_while_goals_are_under_way(harness):
     assert (answer["status"], answer["error"]["code"]) == ("unknown", "ros_error")
 
 
-async def test_goals_are_bounded_and_so_are_kept_results(harness, monkeypatch):
+async def test_goals_and_retained_results_are_limited(harness, monkeypatch):
     monkeypatch.setattr(module, "MAX_RESULTS", 3)
     walks, client = await begin(harness)
     for _ in range(20):
@@ -239,7 +239,7 @@ async def test_goals_are_bounded_and_so_are_kept_results(harness, monkeypatch):
     assert (await client.call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_results_that_are_not_kept(harness):
+async def test_results_that_are_not_retained(harness):
     walks, client = await begin(harness, keep_result=0)
     await client.call(GOAL, {"order": 3})
     await until(lambda: walks.results, "the result is asked for")
@@ -310,7 +310,7 @@ async def test_the_server_of_a_goal_vanishes_after_the_last_route(harness, monke
 
 
 @pytest.mark.parametrize("sent_at", ["-6", "+0.4", "+3600", "yesterday"])
-async def test_a_cancel_is_heard_however_old_it_says_to_be(harness, sent_at):
+async def test_a_cancel_is_carried_out_whatever_age_it_claims(harness, sent_at):
     """It is how an action is stopped."""
     walks, client = await begin(harness)
     goal = (await client.call(GOAL, {"order": 3}))[1]["goal_id"]

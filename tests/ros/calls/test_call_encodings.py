@@ -95,7 +95,7 @@ CALL = "r2d2/switch/_call"
 
 
 @every_encoding
-async def test_the_content_type_goes_before_the_route(harness, encoding):
+async def test_the_content_type_overrides_the_route(harness, encoding):
     for route in TYPES:
         harness.start(service("/switch", encoding=route))
         if not harness.node.remote_services:
@@ -113,7 +113,7 @@ async def test_the_content_type_goes_before_the_route(harness, encoding):
 
 
 @every_encoding
-async def test_without_a_content_type_it_is_the_route_s(harness, encoding):
+async def test_without_a_content_type_the_route_s_encoding_is_used(harness, encoding):
     harness.start(service("/switch", encoding=encoding))
     switch(harness)
     harness.node.spin()
@@ -369,7 +369,7 @@ def test_an_id_goes_before_a_goal_of_ros_1():
 
 
 @every_encoding
-async def test_a_result_that_never_comes_is_told_in_words(harness, encoding):
+async def test_a_missing_result_is_reported_as_json_or_cbor(harness, encoding):
     walks = await begin(harness, encoding=encoding)
     client = harness.client("alice", "r2d2/walk/_result/+")
     await ask(client, GOAL, b"")
@@ -419,7 +419,7 @@ async def test_cancelling_all_and_all_before_a_time(harness):
     assert walks.cancelled == []
 
 
-async def test_who_may_not_cancel_others_goals_may_cancel_its_own(harness):
+async def test_a_client_may_cancel_its_own_goals_without_further_rights(harness):
     walks = await begin(harness)
     harness.rules.deny("bob", "publish", "r2d2/walk/_cancel_any")
     alice, bob = harness.client("alice"), harness.client("bob")

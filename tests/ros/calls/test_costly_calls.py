@@ -1,4 +1,4 @@
-"""Costly messages for a moment; `python tests/ros/costly_calls.py` is longer, and prints times."""
+"""Costly messages, briefly; `python tests/ros/costly_calls.py` runs longer and prints times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SECONDS = 2.0
 
 @pytest.fixture(scope="module")
 def attack(tmp_path_factory):
-    with costly_calls.arena(tmp_path_factory.mktemp("costly")) as attack:
+    with costly_calls.attacked_server(tmp_path_factory.mktemp("costly")) as attack:
         yield attack
 
 
@@ -30,7 +30,7 @@ def attack(tmp_path_factory):
     ],
 )
 def test_another_client_is_served_meanwhile(attack, name):
-    """Without limits and turns the worst of these stopped it for seconds."""
+    """Without limits and the conversion queue the worst of these stalled it for seconds."""
     outcome = attack(name, SECONDS)
     # Few round trips, and a computer that may be busy: 40 of the first took 3.6 s of them.
     problems = costly_calls.problems(outcome, p99=1.0, worst=1.0, least=1)

@@ -127,7 +127,7 @@ async def test_a_flood_of_changes_has_the_node_read_anew(harness, monkeypatch):
     assert arm.asked == ["list"] * 2
 
 
-async def test_one_parameter_that_cannot_be_given_hides_no_others(harness):
+async def test_a_parameter_that_cannot_be_read_hides_no_others(harness):
     harness.start(parameters("/arm/*"))
     arm = Declaring(harness, speed=1, steps=2)
     arm.unset.add("void")
@@ -163,7 +163,7 @@ async def test_routes_that_change_while_they_run(harness):
     assert harness.retained("r2d2/arm/_param/spin") is None
 
 
-async def test_what_a_run_that_was_killed_has_left_is_taken_back(harness):
+async def test_values_that_a_killed_run_has_left_retained_are_cleared(harness):
     before = harness.client("before")
     left = ["r2d2/arm/_param/speed", "r2d2/arm/left/_param/a/b", "r2d2/walk/_status"]
     others = ["r2d2/arm/speed", "r2d2/_param/x", "r2d2/walk/_result/1", "r2d2/run/_status"]
@@ -220,13 +220,13 @@ def test_values_of_another_type_are_refused(kind, value):
     assert raised.value.code == "bad_request"
 
 
-def test_what_may_have_any_type_takes_it_from_the_value():
+def test_a_parameter_of_dynamic_type_takes_the_type_of_the_value():
     free = {"type": 2, "dynamic_typing": True}
     assert to_value("x", 1.5, free) == {"type": 3, "double_value": 1.5}
     assert to_value("x", ["a"], {}) == {"type": 9, "string_array_value": ["a"]}
 
 
-async def test_names_that_make_no_topic_hide_no_others(harness):
+async def test_names_that_are_no_topics_hide_no_others(harness):
     harness.start(parameters("/arm/*"))
     arm = Declaring(harness, **{"a+b": 1, "a\nb": 1, "\ufffe": 1, "x" * 70_000: 1, "speed": 1})
     harness.node.spin()

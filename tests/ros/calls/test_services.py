@@ -198,7 +198,7 @@ async def test_a_type_that_is_not_installed(harness):
     assert "no_pkg" in message
 
 
-async def test_calls_are_bounded_a_client_and_in_all(harness):
+async def test_calls_are_limited_for_each_client_and_in_total(harness):
     harness.start()
     harness.bridge.calls.replace(call_routes(service("/switch"), limits=CallLimits(2, 5, 4)))
     switch = Switch(harness)
@@ -223,7 +223,7 @@ async def test_calls_are_bounded_a_client_and_in_all(harness):
     assert (await clients[0].call(CALL))[0] == "ok"  # all of their places are free again
 
 
-async def test_a_call_without_a_way_back_is_not_carried_out(harness, caplog):
+async def test_a_call_without_a_reply_topic_is_not_carried_out(harness, caplog):
     harness.start(service("/switch"))
     switch = Switch(harness)
     client = harness.client("alice", "r2d2/switch/_reply/alice/#")
@@ -244,7 +244,7 @@ async def test_a_call_without_a_way_back_is_not_carried_out(harness, caplog):
 
 
 @pytest.mark.parametrize("size", [100, 40_000], ids=str)
-async def test_a_way_back_that_no_topic_can_be_is_none(harness, size):
+async def test_a_reply_topic_that_would_be_too_long_is_rejected(harness, size):
     """Its own topic for answers would be longer than a string can be: refused, and no fault."""
     harness.start(service("/switch"))
     switch = Switch(harness)
@@ -329,7 +329,7 @@ async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(harn
 @pytest.mark.parametrize(
     ("ago", "code"), [(60.0, "expired"), (-60.0, "bad_request"), (0.0, None), (3.0, None)]
 )
-async def test_a_call_is_as_old_as_it_says(harness, ago, code):
+async def test_a_call_that_says_to_be_old_has_expired(harness, ago, code):
     """Also the first of a client that was never seen, which may have queued it."""
     harness.start(service("/switch"))
     switch = Switch(harness)
@@ -403,7 +403,7 @@ async def test_routes_come_and_go_while_calls_are_under_way(harness):
     assert harness.counters().calls == 1
 
 
-async def test_what_is_under_way_is_told_when_the_appliance_stops_or_ros_ends(harness):
+async def test_calls_under_way_are_answered_when_the_appliance_stops_or_ros_ends(harness):
     harness.start(service("/switch"))
     switch = Switch(harness)
     switch.holds = True
@@ -422,7 +422,7 @@ async def test_what_is_under_way_is_told_when_the_appliance_stops_or_ros_ends(ha
     assert (await calling)[0] == "stopping"
 
 
-async def test_a_client_that_has_gone_leaves_nothing_behind(harness):
+async def test_the_calls_of_a_client_that_has_gone_are_removed(harness):
     harness.start(service("/switch"))
     Switch(harness)
     client = harness.client("alice")
@@ -593,7 +593,7 @@ async def test_a_call_that_is_too_large(harness):
     assert value(f"{SET_BOOL}_Response", said[0])["success"] is False
 
 
-async def test_calls_are_bounded_in_bytes(harness, monkeypatch):
+async def test_calls_are_limited_in_bytes(harness, monkeypatch):
     monkeypatch.setattr(calls, "MAX_BYTES", 100)
     harness.start(service("/switch"))
     switch = Switch(harness)
@@ -611,7 +611,7 @@ async def test_calls_are_bounded_in_bytes(harness, monkeypatch):
     assert (await client.call(CALL, {"data": True}))[0] == "ok"
 
 
-async def test_a_provided_service_that_is_taken_away_answers_what_is_under_way(harness):
+async def test_a_provided_service_that_is_removed_answers_the_requests_under_way(harness):
     on_error = '{"success": false, "message": "gone"}'
     harness.start(service("/ask", to="mqtt", type=SET_BOOL, on_error=on_error))
     harness.client("alice", "r2d2/ask/_request/+")
@@ -632,7 +632,7 @@ async def test_a_service_of_another_type_than_the_route_says(harness):
     assert text == f"/switch is a {SET_BOOL} on the bus, not a {TRIGGER}"
 
 
-async def test_the_log_calls_nothing_callable_that_nobody_offers(harness, caplog):
+async def test_a_service_that_no_node_offers_is_not_logged_as_callable(harness, caplog):
     caplog.set_level(logging.INFO)
     harness.start(service("/switch"))
     assert "can be called" not in caplog.text

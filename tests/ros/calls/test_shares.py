@@ -1,4 +1,4 @@
-"""What one user does with calls and goals takes nothing from another: on a FakeNode."""
+"""Calls and goals of one user do not exhaust the limits of another, on a FakeNode."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ async def _later(slow):
     slow.finish()
 
 
-async def test_who_cancels_much_keeps_nobody_from_cancelling(harness):
+async def test_many_cancels_of_one_user_do_not_block_those_of_another(harness):
     slow = await begin(harness, CallLimits(client=2, total=8))
     operator = harness.client("operator")
     goal = (await operator.call(GOAL, {"order": 3}))[1]["goal_id"]
@@ -202,7 +202,7 @@ async def test_the_goals_of_one_user_leave_room_for_another(harness):
     assert (await crowd[2].call(GOAL, {"order": 3}))[0] == "ok"
 
 
-async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(harness, monkeypatch):
+async def test_the_owner_of_a_running_goal_is_remembered(harness, monkeypatch):
     """10,118 short goals of another client made it so that its owner could not cancel it."""
     monkeypatch.setattr(actions, "MAX_ENDED", 50)
     slow = await begin(harness)
@@ -229,7 +229,7 @@ async def test_the_owner_of_a_goal_that_goes_on_is_not_forgotten(harness, monkey
     slow.finish()
 
 
-async def test_the_results_of_one_user_leave_those_of_another(harness, monkeypatch):
+async def test_the_results_of_one_user_do_not_evict_those_of_another(harness, monkeypatch):
     monkeypatch.setattr(actions, "MAX_RESULTS", 4)
     slow = await begin(harness)
     operator, mallory = harness.client("operator"), harness.client("mallory")
@@ -248,7 +248,7 @@ async def test_the_results_of_one_user_leave_those_of_another(harness, monkeypat
     assert [harness.retained(topic) is not None for topic in others] == [False] * 3 + [True] * 3
 
 
-async def test_kept_results_are_bounded_in_bytes(harness, monkeypatch):
+async def test_retained_results_are_limited_in_bytes(harness, monkeypatch):
     monkeypatch.setattr(actions, "MAX_RESULT_BYTES", 100)  # of 43 bytes or so each
     slow = await begin(harness)
     client = harness.client("alice")
@@ -260,14 +260,14 @@ async def test_kept_results_are_bounded_in_bytes(harness, monkeypatch):
     assert len(list(harness.broker.retained.find("r2d2/walk/_result/+"))) == 2
 
 
-async def test_what_cancels_is_small(harness):
+async def test_a_call_that_cancels_is_limited_in_size(harness):
     await begin(harness)
     client = harness.client("alice")
     code, text = await client.error(STOP, b'{"all": true}' + b" " * 2000)
     assert code == "too_large" and "takes 1024 at most" in text
 
 
-async def test_errors_of_size_say_which_limit(harness):
+async def test_errors_of_size_name_the_limit(harness):
     harness.start(service("/arrays"), parameters("/arm/*"))
     limits = CallLimits(input=InputLimits(payload=400_000, items=1000))
     harness.bridge.calls.dispatcher.limits = limits
@@ -291,7 +291,7 @@ async def test_errors_of_size_say_which_limit(harness):
     assert asked == [] or len(asked) == 1  # the look at the parameters
 
 
-async def test_who_may_not_call_has_nothing_converted(harness):
+async def test_a_rejected_call_is_not_converted(harness):
     slow = await begin(harness, CallLimits(client=1))
     harness.rules.deny("alice", "publish", "forbidden")
     client = harness.client("alice")
@@ -331,7 +331,7 @@ async def test_commands_and_calls_of_a_client_stay_in_order(harness):
     assert alice.session.account.bytes < 5000
 
 
-async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
+async def test_a_message_that_exceeds_the_conversion_queue_is_rejected(harness, monkeypatch):
     monkeypatch.setattr(turns, "WAITING_OF_USER", 20_000)
     harness.start(topics=[TopicSettings("/a", "ros", "r2d2/a", STRING)])
     peer = harness.node.add_subscriber("/a", STRING)
@@ -346,7 +346,7 @@ async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
     assert harness.bridge.topics()[0].errors == 2
 
 
-# the table
+# the cache
 
 
 @given(
@@ -356,28 +356,28 @@ async def test_who_has_too_much_waiting_is_told_so(harness, monkeypatch):
     st.integers(1, 12),
     st.integers(1, 60) | st.just(math.inf),
 )
-def test_a_fair_table_takes_from_who_has_most(puts, entries, size):
-    table = FairCache(entries, size)
+def test_the_fair_cache_evicts_from_the_largest_user(puts, entries, size):
+    cache = FairCache(entries, size)
     known = {}  # in the order of their coming
     for user, key, weight in puts:
         known.pop(key, None)
         known[key] = user, weight, key
-        for dropped, value in table.put(user, key, key, weight):
+        for dropped, value in cache.put(user, key, key, weight):
             assert value == dropped
             gone, lost, _ = known.pop(dropped)
-            # Nobody loses anything to a user who has more of what there is too much of.
+            # Nobody loses an entry to a user with more.
             mine = [w for u, w, _ in known.values() if u == gone]
             for other in "abc":
                 theirs = [w for u, w, _ in known.values() if u == other]
                 if len(known) + 1 > entries and sum(w for _, w, _ in known.values()) + lost <= size:
                     assert len(theirs) <= len(mine) + 1
-        assert [key for key, _ in table.items()] == list(known)
-        assert len(table) == len(known) <= max(entries, 1)
+        assert [key for key, _ in cache.items()] == list(known)
+        assert len(cache) == len(known) <= max(entries, 1)
         assert sum(w for _, w, _ in known.values()) <= size or len(known) == 1
     for key in list(known):
-        assert key in table and table.get(key) == key
-        table.remove(key)
-    assert len(table) == 0 and table._size == 0 and table._users == {}
+        assert key in cache and cache.get(key) == key
+        cache.remove(key)
+    assert len(cache) == 0 and cache._size == 0 and cache._users == {}
 
 
 # turns
@@ -451,7 +451,7 @@ def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
     assert first.account.bytes == 0
 
 
-def test_what_fails_lets_the_next_have_its_turn(escaped):
+def test_a_failed_conversion_does_not_stop_the_queue(escaped):
     clock, queue = conversion_queue()
     done = []
 
@@ -467,7 +467,7 @@ def test_what_fails_lets_the_next_have_its_turn(escaped):
     escaped.clear()
 
 
-def test_what_cannot_wait_makes_the_others_wait():
+def test_an_immediate_conversion_delays_the_queued_ones():
     clock, queue = conversion_queue()
     done = []
     for _ in range(5):
@@ -479,7 +479,7 @@ def test_what_cannot_wait_makes_the_others_wait():
     assert done[5:] == ["then"]
 
 
-def test_what_waits_takes_memory_of_its_user(monkeypatch):
+def test_queued_payloads_count_against_their_user(monkeypatch):
     clock, queue = conversion_queue(memory=800_000)
     a, b = Who("a"), Who("b")
     queue.do(a, LARGE, lambda: None)
