@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from appliance.broker.accounting import Accounting
     from appliance.broker.session import Session
 
-#: Publishers wait for a reader if its full queue would drain within so many seconds.
+#: Publishers wait for a reader if its full queue would drain within this time, in seconds.
 PATIENCE = 0.25
 
 #: Seconds that a publisher waits at most at a time, whatever the number of its readers, and seconds

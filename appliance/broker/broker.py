@@ -355,7 +355,7 @@ class Broker:
         session.resend()
 
     def attach(self, client_id: str, link: Link) -> Session:
-        """A session inside the appliance, with all rights and kept until `detach`."""
+        """A session inside the appliance, with all rights, which exists until `detach`."""
         before = self.sessions.get(client_id)
         if before is not None:
             if before.identity is None:
@@ -582,7 +582,7 @@ class Broker:
     ) -> ReasonCode:
         """Deliver the message to these targets of its route, which the caller has looked up.
 
-        A message that is `refusable` came from a client that is told the reason code: while the
+        A message that is `refusable` came from a client that gets the reason code: while the
         store fails it is refused if it would have to be stored. Nobody would send another message
         again; it is queued in memory until the store works again.
         """
@@ -593,7 +593,7 @@ class Broker:
             self.observer.published(origin, message)
         retain = message.retain
         # If there is no room to retain it, connected subscribers still get it.
-        kept = not retain or self.retained.keep(message, origin.account, refusable)
+        is_accepted = not retain or self.retained.keep(message, origin.account, refusable)
         published_qos = message.qos
         self.counters.cost += 1 + len(targets)
         taken = full = False
@@ -612,7 +612,7 @@ class Broker:
                 taken = True
             elif qos:
                 if store_fails and session.persistent:
-                    kept = False  # the publisher has to retry, whether or not others got it
+                    is_accepted = False  # the publisher has to retry, whether or not others got it
                 else:
                     self._log_receiver_full(session, message)
                 full = True
@@ -624,12 +624,12 @@ class Broker:
             elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
                 self.counters.publish_dropped += chosen is None
                 if store_fails and any(m[1] and m[0].persistent for m in members):
-                    kept = False
+                    is_accepted = False
                 else:
                     self._log_receiver_full(asked, message)
                 full = True
         message.publisher = None
-        if not kept or (full and not taken):
+        if not is_accepted or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
         # A receiver without room misses the message, which is logged but not reported: the
         # publisher would send it again to all others, because of one tablet that is switched off.

@@ -448,8 +448,9 @@ class ClientHandler:
         """Whether a decision is pending on this client, or another client of its user."""
         identity = self.session.identity if self.session is not None else None
         return identity is not None and any(
-            who == identity or (who.username is not None and who.username == identity.username)
-            for who, _, _ in route.undecided
+            other == identity
+            or (other.username is not None and other.username == identity.username)
+            for other, _, _ in route.undecided
         )
 
     def _is_old(self) -> bool:
@@ -916,8 +917,8 @@ class ClientHandler:
             address, tls_info = self.transport.address, self.transport.tls_info()
             self.broker.audit_log.refused(address, reason, code, name, user, tls_info)
         self._counters.connects_refused += 1
-        tells = code in _EXPLAINED and self.broker.features.reason_strings
-        words = in_words(reason) if tells else None
+        explains = code in _EXPLAINED and self.broker.features.reason_strings
+        words = in_words(reason) if explains else None
         self._send(Connack(False, code, words))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
         self._shut()
 

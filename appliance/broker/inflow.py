@@ -26,7 +26,7 @@ SECONDS_PER_BYTE = 0.8e-6
 #: arrives soon.
 PAUSE_BEHIND = 0.02
 
-#: At most so many bytes in two round trips and PAUSE_BEHIND are "little": a client that catches up
+#: At most this number of bytes in two round trips and PAUSE_BEHIND are "little": a client that catches up
 #: sends several full network packets in that time.
 LITTLE = 4096
 
@@ -37,7 +37,7 @@ FAR_LESS = 1 / 4
 #: the network is assumed to have at least 1.2 times the client's rate.
 CATCHING_UP = 5.0
 
-#: To this is added so many times two round trips and PAUSE_BEHIND: TCP starts slowly.
+#: To this is added FLIGHTS times two round trips and PAUSE_BEHIND: TCP starts slowly.
 FLIGHTS = 10
 
 #: The longest interval between two calls of `check`, in seconds.

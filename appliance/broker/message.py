@@ -50,8 +50,8 @@ class Message:
 
     `publisher` is the session that publishes it, while it is delivered: links inside the appliance
     read it. It is None before and after, as a message may outlive the session by days.
-    `rejection` is what such a link has set when it could not use the message: its publisher is
-    told, in the acknowledgement.
+    `rejection` is set by such a link when it could not use the message; the acknowledgement
+    reports it to the publisher.
     """
 
     __slots__ = (

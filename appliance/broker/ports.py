@@ -297,7 +297,7 @@ class Store(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PublishRejection:
-    """Why a part of the appliance could not use a message, as its publisher is told."""
+    """Why a part of the appliance could not use a message, for the acknowledgement."""
 
     code: ReasonCode
     reason: str

@@ -434,15 +434,15 @@ class Session:
 
     def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
         """Drop queued messages that are too old; returns their number."""
-        kept = deque(delivery for delivery in self.queue if not is_old(delivery[0]))
-        dropped = len(self.queue) - len(kept)
+        remaining = deque(delivery for delivery in self.queue if not is_old(delivery[0]))
+        dropped = len(self.queue) - len(remaining)
         if dropped:
             for delivery in self.queue:
                 if is_old(delivery[0]):
                     self._uncount(delivery[0])
                     self._settled(delivery)
                     self._drop(delivery[0])
-            self.queue = kept
+            self.queue = remaining
             if self.congestion is not None:
                 self._relieve(self.congestion)
         return dropped
@@ -839,14 +839,14 @@ class Session:
             for packet_id, delivery in list(self.inflight.items()):
                 if delivery is not None and delivery[1] == 1 and is_given(delivery):
                     self.give_up(packet_id)
-        kept: deque[Delivery] = deque()
+        remaining: deque[Delivery] = deque()
         for delivery in self.queue:
             if is_given(delivery):
                 self._uncount(delivery[0])
                 self._settled(delivery)
             else:
-                kept.append(delivery)
-        self.queue = kept
+                remaining.append(delivery)
+        self.queue = remaining
         if self.congestion is not None:
             self._relieve(self.congestion)
 

@@ -373,7 +373,7 @@ def decode_properties(buf: bytes, pos: int, end: int, owner: int) -> tuple[Prope
             raise _too_many_pairs(MAXIMUM_PAIRS)
         name, pos = decode_string(buf, pos + 1)
         text, pos = decode_string(buf, pos)
-        # The order of User Properties is kept: v5 [MQTT-3.3.2-18].
+        # The order of User Properties is preserved: v5 [MQTT-3.3.2-18].
         cast("list[tuple[str, str]]", properties.setdefault(identifier, [])).append((name, text))
     return properties, pos
 
@@ -414,9 +414,9 @@ def check_properties(
     stop, pos = _property_section(buf, pos, end)
     if pos == stop:
         return None, pos
-    taken = pos  # properties before this index are in `kept`, or left out
+    taken = pos  # properties before this index are in `forwarded`, or left out
     values: Properties = {}
-    kept: list[bytes] = []
+    forwarded: list[bytes] = []
     buf = buf[:stop]  # so that a truncated value is not completed by later bytes
     count = 0
     while pos < stop:
@@ -430,12 +430,12 @@ def check_properties(
         start = pos
         pos = _decode_property(buf, pos + 1, identifier, rule, values)
         if identifier in _NOT_PASSED_ON:
-            kept.append(buf[taken:start])
+            forwarded.append(buf[taken:start])
             taken = pos
-    if not kept:
+    if not forwarded:
         return CheckedProperties(values, buf[begin:stop], count), pos
-    kept.append(buf[taken:stop])
-    passed_on = b"".join((encode_varint(sum(map(len, kept))), *kept))
+    forwarded.append(buf[taken:stop])
+    passed_on = b"".join((encode_varint(sum(map(len, forwarded))), *forwarded))
     return CheckedProperties(values, passed_on, count), pos
 
 

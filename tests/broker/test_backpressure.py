@@ -1,4 +1,4 @@
-"""Publishers that are faster than their readers: who waits for whom, how long, and who does not.
+"""Backpressure: which publishers wait for slow readers, how long, and which do not wait.
 
 The clients here are driven in steps of a fake clock: in each one they read what came, acknowledge
 as much as they please, and publish as far as their window goes.

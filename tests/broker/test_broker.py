@@ -1,4 +1,4 @@
-"""What messages reach whom: subscriptions, retained messages, sessions, wills, rules and bounds.
+"""Routing and delivery: subscriptions, retained messages, sessions, wills, rules and limits.
 
 Statements of the standards are named as `[MQTT-…]`, those of 5.0 with `v5` where they differ.
 """

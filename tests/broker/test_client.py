@@ -1,4 +1,4 @@
-"""A client's conversation, packet by packet: CONNECT, keep alive, QoS 1 and 2, errors, limits.
+"""The client handler, packet by packet: CONNECT, keep alive, QoS 1 and 2, errors, limits.
 
 Statements of the standards are named as `[MQTT-…]`, those of 5.0 with `v5` where they differ.
 """

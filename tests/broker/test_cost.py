@@ -1,4 +1,4 @@
-"""What is done counts as cost, so that whoever causes much of it lets the others have a turn."""
+"""Work is counted as cost, so that an expensive client yields its turn to the others."""
 
 from __future__ import annotations
 

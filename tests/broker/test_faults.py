@@ -1,4 +1,4 @@
-"""What nobody expected ends the one thing that it arose with: the broker without a network."""
+"""An internal error ends only what it occurred in: the broker, without a network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When what a client sends has come, on times of its own."""
+"""The age of received messages, with a simulated clock."""
 
 from __future__ import annotations
 

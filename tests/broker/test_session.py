@@ -1,4 +1,4 @@
-"""Sessions: any course of events against a naive model, and the parts that need no client."""
+"""Sessions: random events compared with a naive model, and unit tests without a client."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shared subscriptions (5.0 section 4.8.2): members that are there, slow, absent and leaving."""
+"""Shared subscriptions (5.0 section 4.8.2): connected, slow, absent and leaving members."""
 
 from __future__ import annotations
 

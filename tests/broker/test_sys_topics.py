@@ -1,4 +1,4 @@
-"""`$SYS`: mosquitto's names, and figures that are right."""
+"""`$SYS`: mosquitto's topic names, and correct values."""
 
 from __future__ import annotations
 

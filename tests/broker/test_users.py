@@ -1,4 +1,4 @@
-"""A share for each user: whatever one of them holds, the others have what they need."""
+"""Quotas of users: whatever one user holds, the others have their share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rule 2 of the design, acknowledged means kept: what waits for the store, and when it fails."""
+"""Acknowledged means stored: packets wait for commits, and what happens when the store fails."""
 
 from __future__ import annotations
 
