@@ -26,8 +26,8 @@ SECONDS_PER_BYTE = 0.8e-6
 #: arrives soon.
 PAUSE_BEHIND = 0.02
 
-#: At most this number of bytes in two round trips and PAUSE_BEHIND are "little": a client that catches up
-#: sends several full network packets in that time.
+#: At most this number of bytes in two round trips and PAUSE_BEHIND are "little": a client that
+#: catches up sends several full network packets in that time.
 LITTLE = 4096
 
 #: "Little" as a fraction of the highest rate since reading resumed.

@@ -91,7 +91,7 @@ class Output:
         return str(self._client or self.session or "a client")
 
     def open(self, session: Session, aliases: int, *, explains: bool) -> None:
-        """The client has logged in: send the session's messages, with up to `aliases` topic aliases."""
+        """The client has logged in: send the session's messages, with `aliases` topic aliases."""
         self.session = session
         self._alias_maximum = aliases
         self._aliases = {} if aliases else None
