@@ -50,9 +50,9 @@ from appliance.ros.payload.fallback import ConversionError, TooLargeError, accep
 
 __all__ = ["ConversionError", "Converter", "Converters", "TooLargeError", "compile_converter"]
 
-# orjson writes a float32 of a numpy array with the fewest digits that tell it from its neighbours.
-# Readers of JSON take digits for a double, and a double for a float32 once more: of all float32
-# there is one that this leads to its neighbour (each of the 2**31 was tried).
+# orjson writes a float32 of a numpy array with the fewest digits that distinguish it from its
+# neighbours. Readers of JSON convert digits to a double and then to a float32. For one float32
+# these two roundings give its neighbour (each of the 2**31 was tried).
 _TWICE_ROUNDED = b"7.038531e-26"
 
 # Looked up once, as they are called for every message.
@@ -157,8 +157,8 @@ class Converter:
             if size > LARGEST_LENIENT:
                 raise ConversionError(
                     "",
-                    f"it has not exactly the fields of {self.description.name}; what is left out, "
-                    f"or wrong, is looked for in up to {LARGEST_LENIENT} bytes only",
+                    f"it does not have exactly the fields of {self.description.name}; missing "
+                    f"fields are filled in, and wrong ones named, in up to {LARGEST_LENIENT} bytes",
                 ) from None
             return self.from_dict(value)
 

@@ -187,7 +187,7 @@ class _CdrReader:
         left = len(self._cdr) - self._position
         if count * size > left:
             raise ConversionError(
-                path, f"truncated: it says to have {count} items, and {left} bytes are left"
+                path, f"truncated: it announces {count} items, and {left} bytes are left"
             )
         return count
 

@@ -370,7 +370,7 @@ class Ros1Node(FaultContainment):
             Master(self._uri, self.name).call("publisherUpdate", topic, uris)
         for service, uri in served:
             master.call("registerService", service, uri, self._uri)
-        log.info("registered with the ROS Master anew: %d topics and services", count)
+        log.info("registered again with the ROS Master: %d topics and services", count)
 
     def _lacks(self, graph: _Graph, topic: str) -> bool:
         return self.name not in graph.get(topic, ())

@@ -218,7 +218,7 @@ def fetch_definition(master_uri: str, caller: str, node: str, topic: str) -> Def
     try:
         return Definition(header["type"], header["md5sum"], header["message_definition"])
     except KeyError as error:
-        raise BusError(f"{node} does not tell the {error.args[0]} of {topic}") from None
+        raise BusError(f"{node} does not send the {error.args[0]} of {topic}") from None
 
 
 def fetch_service_type(master_uri: str, caller: str, service: str) -> str:
@@ -228,7 +228,7 @@ def fetch_service_type(master_uri: str, caller: str, service: str) -> str:
     with _connect(address, service) as peer:
         header = _shake_hands(peer, fields, service)
     if "type" not in header:
-        raise BusError(f"{service} does not tell its type")
+        raise BusError(f"{service} does not send its type")
     return header["type"]
 
 
@@ -314,7 +314,7 @@ def _address(uri: object, service: str) -> tuple[str, int]:
     raise BusError(f"{service} is at {uri!r}, which is no address of a service")
 
 
-def _connect(address: tuple[str, Any], who: str) -> socket.socket:
+def _connect(address: tuple[str, Any], name: str) -> socket.socket:
     host, port = address
     try:
         peer = socket.create_connection((host, int(port)), TIMEOUT)
@@ -322,13 +322,13 @@ def _connect(address: tuple[str, Any], who: str) -> socket.socket:
     # A node may register a port that is no number or too large, or no valid name (UnicodeError).
     except (OSError, ValueError, TypeError, OverflowError) as error:
         raise BusError(
-            f"{who} cannot be reached at {host}:{port}: {error} (it tells the address that its "
-            "ROS_HOSTNAME or ROS_IP says)"
+            f"{name} cannot be reached at {host}:{port}: {error} (a node registers the address "
+            "in its ROS_HOSTNAME or ROS_IP)"
         ) from error
     return peer
 
 
-def _shake_hands(peer: socket.socket, fields: Mapping[str, str], who: str) -> dict[str, str]:
+def _shake_hands(peer: socket.socket, fields: Mapping[str, str], name: str) -> dict[str, str]:
     """Send a header, and read that of the peer.
 
     Raises BusError, also when the peer's header reports an error, or is not complete within
@@ -340,11 +340,11 @@ def _shake_hands(peer: socket.socket, fields: Mapping[str, str], who: str) -> di
     try:
         peer.sendall(struct.pack("<I", len(header)) + header)
     except OSError as error:
-        raise BusError(f"{who}: {error}") from error
-    found = parse_header(_read_sized(peer, MAX_HEADER_SIZE, who, until))
+        raise BusError(f"{name}: {error}") from error
+    found = parse_header(_read_sized(peer, MAX_HEADER_SIZE, name, until))
     peer.settimeout(TIMEOUT)
     if "error" in found:
-        raise BusError(f"{who} says: {found['error'][:500]}")
+        raise BusError(f"{name} says: {found['error'][:500]}")
     return found
 
 
@@ -365,14 +365,14 @@ def parse_header(data: bytes) -> dict[str, str]:
     return fields
 
 
-def _read_sized(peer: socket.socket, largest: int, who: str, until: float | None = None) -> bytes:
-    size = int.from_bytes(_read(peer, 4, who, until), "little")
+def _read_sized(peer: socket.socket, largest: int, name: str, until: float | None = None) -> bytes:
+    size = int.from_bytes(_read(peer, 4, name, until), "little")
     if size > largest:
-        raise BusError(f"{who} sends {size} bytes, more than the {largest} that are taken")
-    return _read(peer, size, who, until)
+        raise BusError(f"{name} sends {size} bytes, at most {largest} are accepted")
+    return _read(peer, size, name, until)
 
 
-def _read(peer: socket.socket, size: int, who: str, until: float | None = None) -> bytes:
+def _read(peer: socket.socket, size: int, name: str, until: float | None = None) -> bytes:
     """Read `size` bytes; when `until` is given, before that time."""
     data = bytearray()
     while len(data) < size:
@@ -381,8 +381,8 @@ def _read(peer: socket.socket, size: int, who: str, until: float | None = None) 
                 peer.settimeout(max(0.001, until - monotonic()))
             chunk = peer.recv(min(size - len(data), 1 << 20))
         except OSError as error:
-            raise BusError(f"{who}: {error}") from error
+            raise BusError(f"{name}: {error}") from error
         if not chunk:
-            raise BusError(f"{who} closed the connection before it had answered")
+            raise BusError(f"{name} closed the connection before it had answered")
         data += chunk
     return bytes(data)

@@ -217,7 +217,7 @@ class _Parser:
             return self._known[name][0]
         text = self._sections.get(type_name)
         if text is None:
-            raise self._error(f"it does not say what {type_name} is")
+            raise self._error(f"it does not define {type_name}")
         return self.describe(name, type_name, text, above)
 
     def _error(self, problem: str) -> UnknownTypeError:

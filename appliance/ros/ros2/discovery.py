@@ -21,8 +21,8 @@ PEERS = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
 
 #: The risk of an open bus, and what to do, for `check` and `doctor`.
 OPEN = (
-    "ROS 2 is neither encrypted nor asks who comes: whoever is on this network can read all topics "
-    "and publish commands, past the users, rules and leases of MQTT"
+    "ROS 2 neither encrypts nor authenticates: everybody on this network can read all topics and "
+    "publish commands, past the users, rules and leases of MQTT"
 )
 OPEN_ADVICE = (
     "where all nodes are on this computer: bridge.discovery: localhost; else a network of the "
@@ -40,8 +40,9 @@ TWIN_ADVICE = (
 )
 
 OPEN_ROS1 = (
-    "ROS 1 is neither encrypted nor asks who comes: who reaches this computer and the Master can "
-    "publish commands, past the users, rules and leases of MQTT; keep ROS on a network of its own"
+    "ROS 1 neither encrypts nor authenticates: everybody who reaches this computer and the Master "
+    "can publish commands, past the users, rules and leases of MQTT; keep ROS on a network of its "
+    "own"
 )
 
 _SECURITY = ("ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY")

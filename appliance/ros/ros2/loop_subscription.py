@@ -23,8 +23,8 @@ from appliance.ros.node import BusError, TakeBatch
 BATCH = 64
 BATCH_BYTES = 2 * LARGE
 
-#: Seconds of always more than a batch after which it is not a burst any more: the loop cannot keep
-#: up, and the messages that it takes get ever older.
+#: After so many seconds with always more than a batch it is not a burst any more: the loop cannot
+#: keep up, and the messages that it takes get ever older.
 BEHIND_AFTER = 0.5
 
 #: After so many small messages in a row, a topic that had a large one counts as small again.
@@ -60,7 +60,7 @@ class Doorbell:
         self._set_callback.argtypes = [ctypes.c_void_p] * 3
         if self._set_callback(pointer, ring, self.fd):
             os.close(self.fd)
-            raise UnavailableError("this middleware does not tell of new messages")
+            raise UnavailableError("this middleware does not notify of new messages")
 
     def rings(self) -> int:
         """The number of messages that have arrived since the last call."""

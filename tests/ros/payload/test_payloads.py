@@ -185,7 +185,7 @@ async def test_a_picture_is_its_bytes_with_its_content_type(harness):
 async def test_a_raw_image_cannot_be_made_of_its_bytes(harness):
     harness.start(to_ros("/image", type=IMAGE, encoding="binary"))
     await harness.settle()
-    assert "nothing would tell encoding, height" in harness.status("to_ros").last_error
+    assert "binary, which lacks encoding, height" in harness.status("to_ros").last_error
 
 
 # zstd

@@ -162,7 +162,7 @@ def test_a_master_that_is_killed_and_comes_back(
         assert "ROS: the ROS Master does not answer: http://" in run("status")[1]
         world.start()
         appliance.wait_for_log("the ROS Master is back")
-        appliance.wait_for_log("registered with the ROS Master anew")
+        appliance.wait_for_log("registered again with the ROS Master")
         publishers, subscribers, services = world.graph()
         assert "/appliance" in publishers["/hear"] and "/appliance" in subscribers["/many"]
         assert "/appliance" in services["/ask_human"]

@@ -26,7 +26,7 @@ class Encoding(ABC):
     """One way to write a ROS message in an MQTT payload.
 
     An encoding has no state. `encoder` and `decoder` are called once a route and return the
-    function that runs for every message, so that nothing is looked up then.
+    function that runs for every message, so that this needs no lookups.
     """
 
     #: What the configuration calls it.

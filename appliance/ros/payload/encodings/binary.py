@@ -45,7 +45,7 @@ class Binary(Encoding):
         others = {field.name for field in converter.description.fields} - _OPTIONAL
         if to_ros and others:
             raise UnknownTypeError(
-                f"{converter.description.name} cannot be made of binary: nothing would tell "
+                f"{converter.description.name} cannot be built from binary, which lacks "
                 f"{', '.join(sorted(others))}"
             )
 

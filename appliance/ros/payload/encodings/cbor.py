@@ -112,7 +112,7 @@ class Cbor(ValueEncoding):
 def _read_list(tag: cbor2.CBORTag, _: bool) -> list[Any]:
     code = _CODES.get(tag.tag)
     if code is None:
-        raise ValueError(f"tag {tag.tag} has no place in a message")
+        raise ValueError(f"tag {tag.tag} is not allowed in a message")
     if not isinstance(tag.value, bytes):
         raise ValueError(f"the typed array of tag {tag.tag} is not a byte string")
     try:
@@ -131,7 +131,7 @@ def _read_numbers(tag: cbor2.CBORTag, is_immutable: bool) -> Numbers | list[Any]
 
 def _refuse(tag: int) -> Callable[..., object]:
     def refuse(*_: object) -> object:
-        raise ValueError(f"tag {tag} has no place in a message")
+        raise ValueError(f"tag {tag} is not allowed in a message")
 
     return refuse
 

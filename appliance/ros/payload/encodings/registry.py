@@ -1,4 +1,4 @@
-"""The encodings that there are: what adds one adds it here."""
+"""The registry of encodings: a new one is listed here."""
 
 from __future__ import annotations
 
