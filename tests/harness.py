@@ -1,4 +1,4 @@
-"""Listeners with a broker behind them, in the event loop of a test, and clients by raw sockets."""
+"""A harness: listeners and a broker in the event loop of a test, and clients on raw sockets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from appliance.store import MemoryStore
 
 
 def make_contexts(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:
-    """The server's and the client's settings for TLS."""
+    """The TLS contexts of server and client."""
     certs.create_authority(directory, "test")
     certs.issue_server(directory, ["localhost"], [])
     server = certs.server_context(directory / "server.crt", directory / "server.key")
@@ -50,7 +50,7 @@ class Harness:
         self.broker = Broker(AllAllowed(), MemoryStore(), limits or Limits())
         self.client_context = client_context
         self.context = context
-        self.gate = asyncio.Event()  # logins wait for it
+        self.gate = asyncio.Event()  # logins wait until it is set
         self.gate.set()
         self.refused: set[str] = set()
         self.peers: list[Peer] = []
@@ -121,7 +121,7 @@ class Harness:
         return peer
 
     async def close(self) -> None:
-        """The end of a test: nobody is there any more, and nothing is left of them."""
+        """Close everything, and check that nothing is left of the connections."""
         for peer in self.peers:
             peer.hang_up()
         for raw_socket in self.raw_sockets:
@@ -134,7 +134,7 @@ class Harness:
         check_scheduler(self.scheduler)
 
     def protocol(self, client_id: str) -> ClientConnection:
-        """The server's end of a client's connection."""
+        """The server's side of a client's connection."""
         for protocol in self.scheduler.connections:
             session = protocol._client.session
             if session is not None and session.client_id == client_id:
@@ -143,7 +143,7 @@ class Harness:
 
 
 def check_scheduler(scheduler: Scheduler) -> None:
-    """`check_accounts`, with what the connections hold of what came in and of what goes out."""
+    """`check_accounts`, including the input and output that the connections buffer."""
     strangers = scheduler.broker.accounting.accounts.strangers
     accounts = {strangers} | {protocol.account for protocol in scheduler.connections}
     accounts |= {session.account for session in scheduler.broker.sessions.values()}
@@ -160,13 +160,13 @@ def check_scheduler(scheduler: Scheduler) -> None:
 
 
 def abort(transport: asyncio.WriteTransport) -> None:
-    """Close it at once, also when it has closed itself behind its last bytes: asyncio's raises."""
+    """Close it at once; asyncio's raises if it has closed itself after its last bytes."""
     with contextlib.suppress(AttributeError):
         transport.abort()
 
 
 class Peer:
-    """A client's end of a connection."""
+    """The client's side of a connection."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -188,7 +188,7 @@ class Peer:
         return decode_packet(header[0], await self.reader.readexactly(length), 5)
 
     async def receive_rest(self) -> bytes:
-        """What comes until the connection ends."""
+        """All bytes until the connection ends."""
         with contextlib.suppress(ConnectionError):
             return await asyncio.wait_for(self.reader.read(-1), PATIENCE)
         return b""
@@ -198,7 +198,7 @@ class Peer:
 
 
 class PublishObserver:
-    """Does something with each message that comes."""
+    """Calls a function for each published message."""
 
     def __init__(self, harness: Harness, published: Callable[[Message], None]) -> None:
         harness.broker.observer = self  # type: ignore[assignment]
@@ -208,4 +208,4 @@ class PublishObserver:
         self._published(message)
 
     def disconnected(self, session: Session) -> None:
-        """That is of no interest."""
+        """Ignored."""

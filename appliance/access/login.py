@@ -51,7 +51,7 @@ class LoginPlugins(Protocol):
         tls: ssl.SSLObject | None,
         noted: object,
     ) -> None:
-        """The client comes in, whoever decided so; `noted` is None when it was not them."""
+        """The client is admitted; `noted` is None when the plugins were not asked."""
 
 
 def no_user(tls: ssl.SSLObject) -> str | None:

@@ -27,9 +27,9 @@ def for_other_programs(environment: Mapping[str, str] | None = None) -> dict[str
         return result
     inside = Path(sys.prefix, "" if getattr(sys, "frozen", False) else "lib").resolve()
     paths = result.pop(LIBRARIES, "").split(os.pathsep)
-    kept = [path for path in paths if path and not Path(path).resolve().is_relative_to(inside)]
-    if kept:
-        result[LIBRARIES] = os.pathsep.join(kept)
+    others = [path for path in paths if path and not Path(path).resolve().is_relative_to(inside)]
+    if others:
+        result[LIBRARIES] = os.pathsep.join(others)
     return result
 
 

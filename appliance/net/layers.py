@@ -43,7 +43,7 @@ class UpperLayer(Protocol):
 
 
 class LayerScheduler(Protocol):
-    """The scheduler as the layers see it: whoever has much to do waits until others had a turn."""
+    """The scheduler as the layers see it: large input waits until others had a turn."""
 
     entries: Entries
 

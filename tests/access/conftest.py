@@ -1,4 +1,4 @@
-"""Files of users and of rules, and the access that is decided by them."""
+"""Users files and ACL files, and the access that they decide."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clients without a user name: whether they come in is for their listener to say."""
+"""Clients without a user name: their listener decides whether they are admitted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who and what is refused: with which bytes, with which line in the log, and with what untouched.
+"""Refusals: the bytes that a client gets, the line in the log, and the state that is unchanged.
 
 Each on the wire of a running appliance, in both versions, through TLS and without.
 """

@@ -1,4 +1,4 @@
-"""Brute force: guessers are slowed, and nobody who has the right password is kept out by them."""
+"""The login throttle: guesses are delayed, and never lock out who has the right password."""
 
 from __future__ import annotations
 

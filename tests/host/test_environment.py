@@ -1,4 +1,4 @@
-"""What other programs inherit."""
+"""The environment that other programs inherit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Root's commands, where the configuration or what it names is another user's."""
+"""Commands of root, where the configuration, or a file that it names, belongs to another user."""
 
 from __future__ import annotations
 

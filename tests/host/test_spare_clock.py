@@ -1,4 +1,4 @@
-"""What a thread leaves of the processor to the clients of the same computer."""
+"""The processor time that a thread leaves to clients on the same computer."""
 
 from __future__ import annotations
 

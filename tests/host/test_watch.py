@@ -1,4 +1,4 @@
-"""Changed files are told of, however they change."""
+"""Changed files are reported, however they change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every entry from outside is contained: there is a list of them, and none is missing.
+"""Every callback from outside is contained: a scan of the sources finds those that are not.
 
 An entry is what somebody else than our own code calls: the event loop, another thread, a signal.
 What follows looks for all of them in the sources, so that a new one that is not contained fails

@@ -1,4 +1,4 @@
-"""amqtt's own plugins at work: JWT, HTTP, SQL, LDAP; what they may take, and what of it is kept."""
+"""amqtt's own plugins: JWT, HTTP, SQL, LDAP; their time limits, and what of them is cached."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of the computer at the other end of a connection, on real sockets."""
+"""What is known about the computer of a client, on real sockets."""
 
 from __future__ import annotations
 

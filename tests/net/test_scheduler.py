@@ -1,4 +1,4 @@
-"""One round of the event loop: who sends little is served in it, whatever the others send."""
+"""The scheduler: a client that sends little is served in each round, whatever others send."""
 
 from __future__ import annotations
 
