@@ -1,4 +1,4 @@
-"""The node that the bridge is on the robot's bus: what a bus adapter fulfils, and its fake twin."""
+"""The bridge's node on the robot's bus: the protocol of a bus adapter, and a fake for tests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from appliance.ros.payload.definitions import (
 
 
 class BusError(Exception):
-    """The bus refused; the message says what and why."""
+    """The bus has refused something; the message says what and why."""
 
 
 class Reliability(Enum):
@@ -30,7 +30,7 @@ class Reliability(Enum):
 
 
 class Durability(Enum):
-    """Whether a late subscriber is given the last samples (REP 2003)."""
+    """Whether a late subscriber receives the last samples (REP 2003)."""
 
     VOLATILE = "volatile"
     TRANSIENT_LOCAL = "transient local"
@@ -38,14 +38,14 @@ class Durability(Enum):
 
 @dataclass(frozen=True, slots=True)
 class QosProfile:
-    """The QoS of one end of a topic; `depth` is in samples, 0 where it is not known."""
+    """The QoS of an endpoint; `depth` is in samples, 0 if it is not known."""
 
     reliability: Reliability = Reliability.RELIABLE
     durability: Durability = Durability.VOLATILE
     depth: int = 10
 
     def satisfies(self, requested: QosProfile) -> bool:
-        """Whether a publisher with this profile is matched with a subscription's `requested`."""
+        """Whether a publisher with this profile matches a subscription that has `requested`."""
         return (
             self.reliability is Reliability.RELIABLE
             or requested.reliability is Reliability.BEST_EFFORT
@@ -64,7 +64,7 @@ class Endpoint:
     """A publisher or subscription that another node has on a topic.
 
     `node` is that node's full name, `type` as in `std_msgs/msg/String`, `type_hash` as in
-    `RIHS01_…` (REP 2011), None where the bus does not tell.
+    `RIHS01_…` (REP 2011), None where the bus does not report it.
     """
 
     node: str
@@ -77,12 +77,12 @@ class RosSubscription(Protocol):
     """A subscription of this node."""
 
     def destroy(self) -> None:
-        """End it: the callback is not called again, but for what the loop's thread has taken
-        already. On the ROS thread."""
+        """End it: the callback is not called again, except for messages that the loop's thread has
+        taken already. On the ROS thread."""
 
     def take_lost(self) -> int:
-        """How many messages the bus's middleware lost before they came here since it was asked
-        last, as far as it tells: most often once something follows them. On the ROS thread."""
+        """How many messages the middleware has lost since the last call, as far as it reports
+        losses: mostly when another message follows them. On the ROS thread."""
 
 
 class RosPublisher(Protocol):
@@ -104,21 +104,21 @@ class RosClient(Protocol):
     def call(self, request: bytes, done: Callable[[bytes | BusError], None]) -> Callable[[], None]:
         """Send a serialized request; `done` is called with the response, on the ROS thread.
 
-        That may be never: there is no time limit, and servers vanish. What is returned gives the
-        call up, after which `done` is not called. Raises BusError.
+        That may be never: there is no timeout, and servers vanish. Returns a function that cancels
+        the call: `done` is not called after it. Raises BusError.
         """
 
     def destroy(self) -> None:
-        """End it; what is under way is not answered any more."""
+        """End it; calls that are under way get no response any more."""
 
 
-#: Some messages as CDR, each with the time at which it was published, in nanoseconds since the
-#: epoch, or 0; how many others were lost, as there was no room for more; and whether newer ones
-#: have been waiting behind them for so long that this is no burst.
+#: Takes a batch of messages as CDR, each with the time at which it was published, in nanoseconds
+#: since the epoch, or 0; how many others were lost for lack of room; and whether newer messages
+#: have been queued behind them for so long that this is no burst.
 TakeBatch: TypeAlias = Callable[[list[tuple[bytes, int]], int, bool], None]
 
 
-#: Sends the serialized response to one request, None for none at all; on the ROS thread, once.
+#: Sends the serialized response to a request, or none for None; called once, on the ROS thread.
 Respond: TypeAlias = Callable[[bytes | None], None]
 
 
@@ -149,20 +149,20 @@ class RosNode(Protocol):
     only from inside the callbacks, which are called on the ROS thread. Only those of a subscription
     may be called on another, one at a time.
 
-    What is called CDR here is what `serialization` says: the bus's own serialized bytes.
+    CDR stands for the bus's own serialized bytes here; `serialization` says which they are.
     """
 
     #: The node's full name, such as `/appliance`.
     name: str
     #: How messages are serialized on the bus.
     serialization: Serialization
-    #: Where parameters are; None when every node keeps its own, and has services for them.
+    #: The server of all parameters; None if every node has its own, with services for them.
     parameter_server: ParameterServer | None
 
     @property
     def obstacle(self) -> str | None:
-        """What is in the way for now, while the bus is being joined or when it cannot be seen: one
-        line; from any thread."""
+        """What keeps the bus from being joined, or its nodes from being seen, for now: one line;
+        from any thread."""
 
     def start(
         self,
@@ -172,10 +172,10 @@ class RosNode(Protocol):
     ) -> None:
         """Join the bus in the background and return at once.
 
-        `poll` is called when the node is there and then 5 to 10 times a second: the time to look
-        at the graph. `failed` is called once, with one line, when the bus cannot be joined or the
+        `poll` is called when the node is there and then 5 to 10 times a second, to follow the
+        graph. `failed` is called once, with one line, when the bus cannot be joined or the
         node ends by itself; nothing is called after it, until the node is started again.
-        `entries` are of the loop whose thread may take messages itself, and is told of faults.
+        `entries` are of the loop whose thread may take messages itself, and counts the faults.
         """
 
     def stop(self) -> None:
@@ -185,23 +185,23 @@ class RosNode(Protocol):
         """Call it on the ROS thread. Raises BusError when there is none."""
 
     def now(self) -> int:
-        """ROS's time in nanoseconds since the epoch; from any thread. It is the simulation's where
-        the node is told so: 0 until /clock says something, as in every node."""
+        """ROS's time in nanoseconds since the epoch; from any thread. With `use_sim_time` it is the
+        simulation's: 0 until the first message of /clock, as in every node."""
 
     def nodes(self) -> list[str]:
-        """The full names of all nodes on the bus, as far as they are known, this one included."""
+        """The full names of all known nodes on the bus, including this one."""
 
     def topics(self) -> dict[str, list[str]]:
-        """The types of each topic that has an endpoint, this node's own included."""
+        """The types of each topic that has an endpoint, including this node's."""
 
     def services(self) -> dict[str, list[str]]:
-        """The types of each service that has a server, this node's own included.
+        """The types of each service that has a server, including this node's.
 
         An action's services are among them: `/name/_action/send_goal` and so on.
         """
 
     def count(self, topic: str) -> tuple[int, int]:
-        """How many publishers and subscriptions there are, own ones included; the cheapest look."""
+        """The number of publishers and subscriptions, including our own; the cheapest query."""
 
     def publishers(self, topic: str) -> list[Endpoint]:
         """The publishers of other nodes."""
@@ -210,9 +210,9 @@ class RosNode(Protocol):
         """The subscriptions of other nodes."""
 
     def describe(self, type_name: str) -> TypeDescription:
-        """What `std_msgs/msg/String` is made of; may be asked from any thread.
+        """The description of a type such as `std_msgs/msg/String`; from any thread.
 
-        Raises UnknownTypeError, and BusError when that is still to be found out.
+        Raises UnknownTypeError, and BusError if it is not known yet.
         """
 
     def subscribe_raw(
@@ -225,24 +225,24 @@ class RosNode(Protocol):
         timed: bool = False,
         on_loop: TakeBatch | None = None,
     ) -> RosSubscription:
-        """Call `callback` with each message, as CDR; when it is `timed`, with a few also with the
+        """Call `callback` with each message, as CDR. If `timed`, for a few messages also with the
         time at which they were published, in nanoseconds since the epoch.
 
-        Where the bus can wake the event loop by itself, `on_loop` is called instead, on the loop's
-        thread, while messages are small: it saves waking the ROS thread for each of them. The two
-        are never called at once, and all messages come in their order.
+        If the bus can wake the event loop itself, `on_loop` is called instead for small messages,
+        on the loop's thread: that saves waking the ROS thread for each of them. The two are never
+        called at once, and all messages come in their order.
 
         Raises BusError, UnknownTypeError.
         """
 
     def resolve(self, topic: str) -> str:
-        """The topic's name on the bus, which remappings may make another."""
+        """The topic's name on the bus, after remapping."""
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
         """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""
 
     def create_client(self, service: str, type_name: str) -> RosClient:
-        """Make a client of `std_srvs/srv/Trigger`, or of a service that an action is made of:
+        """Make a client of a service such as `std_srvs/srv/Trigger`, or of a service of an action:
         `pkg/action/Name_SendGoal`, `pkg/action/Name_GetResult`.
 
         Raises BusError, UnknownTypeError.
@@ -254,7 +254,7 @@ class RosNode(Protocol):
         """Call `callback` with each serialized request. Raises BusError, UnknownTypeError."""
 
 
-# The twin
+# The fake, for tests
 
 
 @dataclass(eq=False, slots=True)
@@ -290,7 +290,7 @@ class FakeSubscription:
     endpoint: Endpoint
     callback: Callable[..., None]
     on_loop: TakeBatch | None = None
-    #: What the middleware has lost and nobody has asked for yet.
+    #: The losses that `take_lost` has not returned yet.
     lost: int = 0
 
     def take(self, cdr: bytes) -> None:
@@ -382,10 +382,10 @@ class FakeClient:
 class FakeNode:
     """A RosNode on a bus of its own, without threads: everything happens in the caller's.
 
-    Other nodes' endpoints are added and removed by hand, and each time the bridge gets its look at
-    the graph at once. Messages reach subscriptions whose QoS and type match, own ones included, as
-    on a real bus. `types` are the types that can be loaded; None: any, as an empty class. With
-    `takes_on_loop` set, the caller's thread is the loop's for those who offered to be called there.
+    A test adds and removes endpoints of other nodes, and each time the bridge polls the graph at
+    once. Messages reach subscriptions whose QoS and type match, including our own, as on a real
+    bus. `types` are the types that can be loaded; None: any, as an empty class. With
+    `takes_on_loop` set, `on_loop` of subscriptions is called, in the caller's thread.
     """
 
     serialization = CDR
@@ -396,7 +396,7 @@ class FakeNode:
         self.name = name
         self.types = types
         self.running = False
-        #: What topics are called on the bus, where that is something else.
+        #: The names of remapped topics on the bus.
         self.remapped: dict[str, str] = {}
         self.takes_on_loop = False
         self.remote_publishers: list[FakePeer] = []
@@ -409,7 +409,7 @@ class FakeNode:
         self._poll: Callable[[], None] | None = None
         self._failed: Callable[[str], None] | None = None
 
-    # The other nodes, and the test's hands
+    # What a test does, and the other nodes
 
     def add_publisher(
         self,
@@ -457,7 +457,7 @@ class FakeNode:
                 service.handler(request, done)
 
     def spin(self) -> None:
-        """Let the bridge look at the graph."""
+        """Let the bridge poll the graph."""
         if self.running and self._poll:
             self._poll()
 
@@ -468,7 +468,7 @@ class FakeNode:
             self._failed(reason)
 
     def deliver(self, topic: str, publisher: Endpoint, cdr: bytes) -> None:
-        """Hand a message to the subscriptions that match."""
+        """Deliver a message to the subscriptions that match."""
 
         def matches(other_topic: str, other: Endpoint) -> bool:
             return (

@@ -365,18 +365,18 @@ def sent_at(properties: Properties | None) -> float | None:
     The property is RFC 3339, or a number. Raises ValueError for anything else, and for two of them.
     """
     pairs = (properties or {}).get(Property.USER_PROPERTY)
-    said = [
+    values = [
         str(pair[1])
         for pair in (pairs if isinstance(pairs, list) else ())
         if isinstance(pair, tuple) and pair[0] == SENT_AT
     ]
-    if not said:
+    if not values:
         return None
-    if len(said) > 1:
-        raise ValueError(f"it says {SENT_AT} {len(said)} times")
-    problem = f"its {SENT_AT} is {quote(said[0][:40])}"
+    if len(values) > 1:
+        raise ValueError(f"it says {SENT_AT} {len(values)} times")
+    problem = f"its {SENT_AT} is {quote(values[0][:40])}"
     try:
-        seconds = _seconds(said[0])
+        seconds = _seconds(values[0])
     except (ValueError, OverflowError) as error:
         what = str(error) if isinstance(error, _NoZoneError) else f"it takes {_FORMS}"
         raise ValueError(f"{problem}: {what}") from None

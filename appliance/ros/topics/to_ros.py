@@ -211,7 +211,7 @@ class ToRos(Flow):
         problem: str,
         code: ReasonCode = ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
     ) -> PublishRejection:
-        """What the client is told: the code, and why. For QoS 1 its PUBACK says so."""
+        """The rejection that is sent to the client; for QoS 1 its PUBACK carries it."""
         rejection = PublishRejection(code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
         if message.qos == 1:
             message.rejection = rejection
@@ -269,12 +269,12 @@ class ToRos(Flow):
         try:
             return convert(message.payload)
         except ConversionError as error:
-            said = properties.get(Property.CONTENT_TYPE)
+            stated = properties.get(Property.CONTENT_TYPE)
             encoding = self.settings.encoding
-            if not isinstance(said, str) or said == ENCODINGS[encoding].content_type:
+            if not isinstance(stated, str) or stated == ENCODINGS[encoding].content_type:
                 raise
             problem = (
-                f"{error.problem} (it says to be {quote(said)}, and the route takes {encoding})"
+                f"{error.problem} (it says to be {quote(stated)}, and the route takes {encoding})"
             )
             raise ConversionError(error.path, problem) from None
 
