@@ -30,7 +30,7 @@ PACKAGE = Path(__file__).parents[1] / "appliance"
 NAMED = {
     "_abandon",
     "_contained",
-    "_tell_fault",
+    "_report_fault",
     "at",
     "caught",
     "contained",

@@ -28,11 +28,11 @@ class FaultContainment:
             try:
                 callback(*args)
             except Exception as error:  # it would end the thread, or the whole process
-                self._tell_fault(entry, error)
+                self._report_fault(entry, error)
 
         return run
 
-    def _tell_fault(self, entry: str, error: Exception) -> None:
+    def _report_fault(self, entry: str, error: Exception) -> None:
         """Count, on the loop's thread, what was caught on this one."""
         entries = self._entries
         with suppress(RuntimeError):  # the loop is closed: nobody can receive it

@@ -255,7 +255,7 @@ class Ros2Node(FaultContainment):
             try:
                 callback()
             except Exception as error:  # in EventsExecutor it would end the whole process
-                self._tell_fault("ros.task", error)
+                self._report_fault("ros.task", error)
 
         executor.create_task(run)
 
