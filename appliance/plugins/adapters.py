@@ -168,7 +168,7 @@ def retained_message(source: AmqttSession | None, message: Message) -> RetainedA
     return RetainedApplicationMessage(source, message.topic, message.payload, message.qos)
 
 
-class RetainedMessages(MutableMapping[str, RetainedApplicationMessage]):
+class RetainedMessageViews(MutableMapping[str, RetainedApplicationMessage]):
     """The retained messages by topic. Changes made here fire no events."""
 
     def __init__(self, broker: Broker, retain: Callable[[str, bytes, int | None], None]) -> None:

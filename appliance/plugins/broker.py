@@ -35,7 +35,7 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 from appliance.net.callbacks import Entries, PeriodicCallback, contained_proxy
 from appliance.plugins.access import PluginAccess
-from appliance.plugins.adapters import RetainedMessages, SessionViews, UnclaimedIdentity
+from appliance.plugins.adapters import RetainedMessageViews, SessionViews, UnclaimedIdentity
 from appliance.plugins.events import PluginEvents
 from appliance.plugins.guard import PLUGIN_TIMEOUT, PluginGuard, plugin_name
 from appliance.plugins.logins import CachePolicy, PluginLogins, Throttle
@@ -211,7 +211,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         )
         # BrokerContext reads and writes these: they are views of our broker.
         self._sessions = cast(Any, self._views)
-        self._retained_messages = cast(Any, RetainedMessages(broker, self._retain_quietly))
+        self._retained_messages = cast(Any, RetainedMessageViews(broker, self._retain_quietly))
 
     # --- life cycle ----------------------------------------------------------------------------
 
