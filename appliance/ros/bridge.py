@@ -262,7 +262,7 @@ class Bridge:
 
     def start(self) -> None:
         """Subscribe on MQTT, and join the bus in the background."""
-        self._session = self._broker.attach(BRIDGE_CLIENT_ID, _Link(self._receive))
+        self._session = self._broker.attach(BRIDGE_CLIENT_ID, _BridgeLink(self._receive))
         self._subscribe()
         self._broker.departures.append(self._context.staleness.on_departed)
         self.calls.start()
@@ -556,7 +556,7 @@ class Bridge:
             log.debug("the event loop is closed")
 
 
-class _Link(InsideLink):
+class _BridgeLink(InsideLink):
     """The link of the bridge's session."""
 
     def __init__(self, receive: Callable[[Message, bool, Session | None], None]) -> None:

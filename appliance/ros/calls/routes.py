@@ -58,8 +58,8 @@ class CallStatus:
     counters: CallCounters
 
 
-class GraphFollower(Protocol):
-    """What follows the graph, on the ROS thread."""
+class GraphPoller(Protocol):
+    """Polls the graph, on the ROS thread."""
 
     def poll_graph(self) -> None:
         """Follow what has come and gone on the graph."""
@@ -75,7 +75,7 @@ class CallPoller:
     def __init__(
         self,
         clients: ServiceClients,
-        others: Sequence[GraphFollower],
+        others: Sequence[GraphPoller],
         faults: Faults,
         post: Callable[..., None],
     ) -> None:
