@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from appliance.access import Passwords
     from appliance.config import Settings
 
-user_app = typer.Typer(no_args_is_help=True, help="Who may come in.")
-acl_app = typer.Typer(no_args_is_help=True, help="Who may read and write what.")
+user_app = typer.Typer(no_args_is_help=True, help="Users and their passwords.")
+acl_app = typer.Typer(no_args_is_help=True, help="Access rules: who may read and write what.")
 
 
 @user_app.command("add")
@@ -36,12 +36,12 @@ def user_add(
         bool,
         typer.Option(
             "--scram",
-            help="Keep the password for SCRAM-SHA-256, MQTT 5's login that does not send it; one "
-            "that sends it works too.",
+            help="Store the password for SCRAM-SHA-256, an MQTT 5 login that does not send it; "
+            "logins that send it work as well.",
         ),
     ] = False,
 ) -> None:
-    """Add a user; the password is asked for unless an option says where it comes from."""
+    """Add a user; asks for the password unless an option provides it."""
     settings = load(config)
     with _users(settings, new=True) as users:
         if name in users.users():
@@ -63,7 +63,7 @@ def user_passwd(
         bool | None,
         typer.Option(
             "--scram/--no-scram",
-            help="Keep the password for SCRAM-SHA-256, or as argon2id; else as it is kept now.",
+            help="Store the password for SCRAM-SHA-256, or as argon2id; default: as before.",
             show_default=False,
         ),
     ] = None,
@@ -94,7 +94,7 @@ def user_remove(name: str, config: ConfigOption = None) -> None:
 
 @user_app.command("list")
 def user_list(config: ConfigOption = None) -> None:
-    """Print the users' names, one a line, and how each one's password is kept."""
+    """Print the users, one per line, and how each password is stored."""
     with _users(load(config)) as users:
         names = users.users()
         width = max(map(len, names), default=0)
@@ -104,7 +104,7 @@ def user_list(config: ConfigOption = None) -> None:
 
 @contextmanager
 def _users(settings: Settings, *, new: bool = False) -> Iterator[Passwords]:
-    """The users file; what is wrong with it, or with writing it, is a CommandError."""
+    """The users file; errors in it, or in writing it, become a CommandError."""
     from appliance.access import AccessFileError, Passwords
     from appliance.host.owners import OwnerError, acting_for
 
@@ -118,7 +118,7 @@ def _users(settings: Settings, *, new: bool = False) -> Iterator[Passwords]:
 
 
 def _note(settings: Settings, what: str, user: str) -> None:
-    """Have a change in the audit log, if there is one; it is done whether that works or not."""
+    """Record a change in the audit log, if there is one; a failure only prints a warning."""
     from appliance.host.owners import OwnerError, acting_for
     from appliance.ops.audit import note
 
@@ -151,14 +151,14 @@ def _set_password(
 
 @acl_app.command("explain")
 def acl_explain(
-    user: Annotated[str, typer.Argument(help="The user's name; '' for a client without one.")],
+    user: Annotated[str, typer.Argument(help="The user name; '' for a client without one.")],
     topic: Annotated[str, typer.Argument(help="A topic, or a filter with + and #.")],
     client_id: Annotated[
-        str, typer.Option(help="For rules with %c; else one that no rule speaks of.")
+        str, typer.Option(help="For rules with %c; default: an id that no rule names.")
     ] = "",
     config: ConfigOption = None,
 ) -> None:
-    """Say what a user may do with a topic, and which rule of which file decides it."""
+    """Show what a user may do with a topic, and which rule of which file decides it."""
     settings = load(config)
     from appliance.access import AccessFileError, Acl, Passwords
     from appliance.broker.ports import Identity

@@ -1,6 +1,6 @@
-"""`appliance call`, `goal` and `param`: what MQTT clients can ask of a robot.
+"""The commands `appliance call`, `goal` and `param`, which call a robot over MQTT.
 
-They are what `ros2 service call`, `ros2 action send_goal` and `ros2 param` are on the robot.
+They correspond to `ros2 service call`, `ros2 action send_goal` and `ros2 param`.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ param_app = typer.Typer(no_args_is_help=True, help="Parameters of the robot's no
 
 
 @contextmanager
-def _caller(reach: CallTarget) -> Iterator[RpcClient]:
+def _rpc_client(options: CallTarget) -> Iterator[RpcClient]:
     from appliance.cli.mqtt_client import ClientError
     from appliance.cli.rpc_client import RpcClient
 
     try:
-        caller = RpcClient(reach.target())
+        client = RpcClient(options.target())
         try:
-            yield caller
+            yield client
         finally:
-            caller.close()
+            client.close()
     except ClientError as error:
         raise CommandError(str(error)) from None
 
 
 def _payload(text: str) -> bytes:
-    """The JSON that somebody typed, or YAML, which needs fewer quotes; - is standard input."""
+    """The payload as JSON, from JSON or YAML, which needs fewer quotes; - is standard input."""
     if text == "-":
         text = sys.stdin.read()
     if not text.strip():
@@ -66,31 +66,31 @@ def _print(line: bytes) -> None:
 
 @connecting
 def call(
-    reach: CallTarget,
-    service: Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")],
+    options: CallTarget,
+    service: Annotated[str, typer.Argument(help="ROS name or MQTT topic.")],
     request: Annotated[
         str, typer.Argument(metavar="JSON", help="The request's fields; - is standard input.")
     ] = "",
     timeout: Annotated[
-        float, typer.Option("--timeout", "-W", min=0, help="Longest wait for the answer, in s.")
+        float, typer.Option("--timeout", "-W", min=0, help="Seconds to wait for the answer.")
     ] = 10.0,
 ) -> None:
     """Call a ROS service, and print its answer.
 
-    Fields that are left out have their default; YAML will do as well as JSON.
-    When it fails, the reason is on standard error and the exit code is 1.
+    Fields that are not given have their defaults; YAML works as well as JSON.
+    When the call fails, the reason is on standard error and the exit code is 1.
 
     Example: appliance call -u alice /arm/grip '{"data": true}'
     """
-    topic, payload = f"{reach.topic(service)}/_call", _payload(request)
-    with _caller(reach) as caller:
-        _print(caller.call(topic, payload, timeout))
+    topic, payload = f"{options.topic(service)}/_call", _payload(request)
+    with _rpc_client(options) as client:
+        _print(client.call(topic, payload, timeout))
 
 
 @connecting
 def goal(
-    reach: CallTarget,
-    action: Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")],
+    options: CallTarget,
+    action: Annotated[str, typer.Argument(help="ROS name or MQTT topic.")],
     fields: Annotated[
         str, typer.Argument(metavar="JSON", help="The goal's fields; - is standard input.")
     ] = "",
@@ -99,19 +99,21 @@ def goal(
     ] = True,
     timeout: Annotated[
         float | None,
-        typer.Option("--timeout", "-W", min=0, help="Cancel it after so many seconds; else never."),
+        typer.Option(
+            "--timeout", "-W", min=0, help="Cancel the goal after so many seconds; default: never."
+        ),
     ] = None,
 ) -> None:
     """Send a goal to a ROS action, and print feedback and result; Ctrl-C cancels it.
 
-    Each line begins with what it is: goal, feedback, and at the end
-    succeeded, canceled or aborted. The exit code is 0 when it has succeeded.
+    Each line begins with its kind: goal, feedback, and at the end
+    succeeded, canceled or aborted. The exit code is 0 when the goal succeeded.
 
     Example: appliance goal -u alice /walk '{"order": 5}'
     """
-    topic, payload = reach.topic(action), _payload(fields)
-    with _caller(reach) as caller, _stop_signals() as caught:
-        outcome = caller.goal(
+    topic, payload = options.topic(action), _payload(fields)
+    with _rpc_client(options) as client, _stop_signals() as caught:
+        outcome = client.goal(
             topic,
             payload,
             accepted=lambda id_: _print(f"goal {id_}".encode()),
@@ -128,7 +130,7 @@ def goal(
 
 @contextmanager
 def _stop_signals() -> Iterator[list[int]]:
-    """SIGINT and SIGTERM are put in the list; a second one ends the command as ever."""
+    """Collect SIGINT and SIGTERM in a list; a second signal ends the command as usual."""
     caught: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -148,16 +150,16 @@ def _stop_signals() -> Iterator[list[int]]:
         restore()
 
 
-NodeArgument = Annotated[str, typer.Argument(help="Its ROS name, or its MQTT topic.")]
+NodeArgument = Annotated[str, typer.Argument(help="ROS name or MQTT topic.")]
 ShownTimeout = Annotated[
-    float, typer.Option("--timeout", "-W", min=0, help="Longest wait for a value, in s.")
+    float, typer.Option("--timeout", "-W", min=0, help="Seconds to wait for a value.")
 ]
 
 
 @param_app.command("get")
 @connecting
 def param_get(
-    reach: CallTarget,
+    options: CallTarget,
     node: NodeArgument,
     name: Annotated[str, typer.Argument(help="The parameter.")],
     timeout: ShownTimeout = 3.0,
@@ -166,9 +168,9 @@ def param_get(
 
     Example: appliance param get -u alice /controller max_speed
     """
-    topic = f"{reach.topic(node)}/_param/{name}"
-    with _caller(reach) as caller:
-        values = caller.parameters(topic, timeout)
+    topic = f"{options.topic(node)}/_param/{name}"
+    with _rpc_client(options) as client:
+        values = client.parameters(topic, timeout)
     if topic not in values:
         raise CommandError(_not_shown(topic, timeout))
     _print(values[topic])
@@ -176,14 +178,14 @@ def param_get(
 
 @param_app.command("list")
 @connecting
-def param_list(reach: CallTarget, node: NodeArgument, timeout: ShownTimeout = 3.0) -> None:
-    """Print a node's parameters and their values, one a line.
+def param_list(options: CallTarget, node: NodeArgument, timeout: ShownTimeout = 3.0) -> None:
+    """Print a node's parameters and their values, one per line.
 
     Example: appliance param list -u alice /controller
     """
-    base = f"{reach.topic(node)}/_param"
-    with _caller(reach) as caller:
-        values = caller.parameters(f"{base}/+", timeout)
+    base = f"{options.topic(node)}/_param"
+    with _rpc_client(options) as client:
+        values = client.parameters(f"{base}/+", timeout)
     if not values:
         raise CommandError(_not_shown(f"{base}/+", timeout))
     for topic, value in sorted(values.items()):
@@ -200,18 +202,18 @@ def _not_shown(topic: str, timeout: float) -> str:
 @param_app.command("set")
 @connecting
 def param_set(
-    reach: CallTarget,
+    options: CallTarget,
     node: NodeArgument,
     name: Annotated[str, typer.Argument(help="The parameter.")],
-    value: Annotated[str, typer.Argument(help="Its value, as JSON or YAML.")],
+    value: Annotated[str, typer.Argument(help="The value, as JSON or YAML.")],
     timeout: Annotated[
-        float, typer.Option("--timeout", "-W", min=0, help="Longest wait for the answer, in s.")
+        float, typer.Option("--timeout", "-W", min=0, help="Seconds to wait for the answer.")
     ] = 10.0,
 ) -> None:
-    """Set a node's parameter; the node's reason is told when it does not.
+    """Set a node's parameter; prints the node's reason when it refuses.
 
     Example: appliance param set -u alice /controller max_speed 0.4
     """
-    topic, payload = f"{reach.topic(node)}/_param/{name}/set", _payload(value)
-    with _caller(reach) as caller:
-        caller.call(topic, payload, timeout)
+    topic, payload = f"{options.topic(node)}/_param/{name}/set", _payload(value)
+    with _rpc_client(options) as client:
+        client.call(topic, payload, timeout)

@@ -25,9 +25,7 @@ cert_app = typer.Typer(no_args_is_help=True, help="Certificates of clients and o
 
 CaKeyOption = Annotated[
     Path | None,
-    typer.Option(
-        "--ca-key", metavar="FILE", help="The authority's key, when it is kept elsewhere."
-    ),
+    typer.Option("--ca-key", metavar="FILE", help="The CA's key, when it is stored elsewhere."),
 ]
 
 
@@ -35,17 +33,20 @@ CaKeyOption = Annotated[
 def cert_issue(
     name: Annotated[str, typer.Argument(help="The client's name.")],
     pkcs12: Annotated[
-        bool, typer.Option("--pkcs12", help="Also NAME.p12, for phones, with a password.")
+        bool, typer.Option("--pkcs12", help="Also write NAME.p12, for phones, with a password.")
     ] = False,
     bundle: Annotated[
-        bool, typer.Option("--bundle", help="Also NAME.pem: key, certificate and ca.crt in one.")
+        bool,
+        typer.Option(
+            "--bundle", help="Also write NAME.pem: key, certificate and ca.crt in one file."
+        ),
     ] = False,
     password_file: PasswordFileOption = None,
     generate: GenerateOption = False,
     ca_key: CaKeyOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Make a key and a certificate for a client, and what options ask for of those it has."""
+    """Make a key and a certificate for a client; options also export those that it has."""
     if (password_file or generate) and not pkcs12:
         raise typer.BadParameter("a password is for --pkcs12")
     with _directory(config) as directory:
@@ -58,7 +59,7 @@ def cert_issue(
                 f"{name} has a certificate, {shown(certificate)}; `appliance cert renew {name}` "
                 f"makes it anew, after `appliance cert revoke {name}` this makes one with a new key"
             )
-        # Asked for before anything is made, as it may not be given.
+        # Ask for it before anything is written, because the user may cancel.
         password = new_password(f"{name}.p12", password_file, generate) if pkcs12 else None
         if password is not None:
             certs.check_password(password)
@@ -77,12 +78,12 @@ def cert_issue(
 def cert_sign(
     request: Annotated[str, typer.Argument(metavar="FILE", help="The request; - is stdin.")],
     name: Annotated[
-        str | None, typer.Option(help="The client's name; else the request's common name.")
+        str | None, typer.Option(help="The client's name; default: the request's common name.")
     ] = None,
     ca_key: CaKeyOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Make a certificate of a request (PKCS #10), whose key stays on the device."""
+    """Make a certificate from a request (PKCS #10); the key stays on the device."""
     with _directory(config) as directory:
         from appliance import certs
 
@@ -106,7 +107,7 @@ def cert_revoke(
         str, typer.Argument(metavar="NAME|SERIAL|FILE", help="As `cert list` shows them.")
     ],
     yes: Annotated[
-        bool, typer.Option("--yes", help="Do not ask before the server's own is revoked.")
+        bool, typer.Option("--yes", help="Do not ask before revoking the server's own certificate.")
     ] = False,
     ca_key: CaKeyOption = None,
     config: ConfigOption = None,
@@ -138,12 +139,12 @@ def _ask_about_the_server() -> None:
 @cert_app.command("renew")
 def cert_renew(
     what: Annotated[
-        str, typer.Argument(metavar="NAME|server|all", help="A client, the server, or everyone.")
+        str, typer.Argument(metavar="NAME|server|all", help="A client, the server, or all.")
     ],
     ca_key: CaKeyOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Make a certificate anew, for the same key and names."""
+    """Renew a certificate, with the same key and names."""
     with _directory(config) as directory:
         from appliance import certs
 
@@ -159,14 +160,14 @@ def cert_renew(
 @cert_app.command("list")
 def cert_list(
     every: Annotated[
-        bool, typer.Option("--all", help="Also those that expired or were replaced by a newer one.")
+        bool, typer.Option("--all", help="Also expired and replaced certificates.")
     ] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="For machines, an object a line.")
+        bool, typer.Option("--json", help="Print a line of JSON per certificate.")
     ] = False,
     config: ConfigOption = None,
 ) -> None:
-    """Print what there is, what it is for, and for how many days it is valid."""
+    """List the certificates, their purposes, and for how many days they are valid."""
     with _directory(config) as directory:
         from appliance import certs
 
@@ -189,7 +190,7 @@ def cert_list(
 
 @cert_app.command("crl")
 def cert_crl(ca_key: CaKeyOption = None, config: ConfigOption = None) -> None:
-    """Make ca.crl, the list of what was revoked, anew: for programs that want a fresh one."""
+    """Renew ca.crl, the revocation list, for programs that require a recent one."""
     with _directory(config) as directory:
         from appliance import certs
 
@@ -199,7 +200,7 @@ def cert_crl(ca_key: CaKeyOption = None, config: ConfigOption = None) -> None:
 
 @contextmanager
 def _directory(config: Path | None) -> Iterator[Path]:
-    """Where the authority is; what is wrong with it, or with what is asked, is a CommandError."""
+    """The directory of the CA; errors in it, or in the request, become a CommandError."""
     settings = load(config)
     tls = settings.broker.tls
     directory = tls.ca.parent

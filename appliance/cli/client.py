@@ -20,18 +20,22 @@ def pub(
     connection: ConnectionOptions,
     topic: str,
     message: Annotated[
-        str | None, typer.Option("--message", "-m", help="The payload; else standard input.")
+        str | None, typer.Option("--message", "-m", help="The payload; default: standard input.")
     ] = None,
     file: Annotated[
-        Path | None, typer.Option("--file", "-f", metavar="FILE", help="The payload's file.")
+        Path | None,
+        typer.Option("--file", "-f", metavar="FILE", help="Read the payload from this file."),
     ] = None,
     lines: Annotated[
-        bool, typer.Option("--lines", "-l", help="Each line of standard input is a message.")
+        bool,
+        typer.Option("--lines", "-l", help="Publish each line of standard input as a message."),
     ] = False,
     qos: Annotated[
-        int, typer.Option("--qos", "-q", min=0, max=2, help="From 1 on, a refusal is told.")
+        int, typer.Option("--qos", "-q", min=0, max=2, help="With 1 and 2 a refusal is reported.")
     ] = 1,
-    retain: Annotated[bool, typer.Option("--retain", "-r", help="Keep it on the broker.")] = False,
+    retain: Annotated[
+        bool, typer.Option("--retain", "-r", help="Let the broker retain the message.")
+    ] = False,
 ) -> None:
     """Publish a message."""
     if (message is not None) + (file is not None) + lines > 1:
@@ -58,18 +62,23 @@ def sub(
     connection: ConnectionOptions,
     filters: Annotated[list[str], typer.Argument(metavar="FILTER...")],
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="The topic before each payload.")
+        bool, typer.Option("--verbose", "-v", help="Print the topic before each payload.")
     ] = False,
     count: Annotated[
         int | None, typer.Option("--count", "-C", min=1, help="End after so many messages.")
     ] = None,
     timeout: Annotated[
         float | None,
-        typer.Option("--timeout", "-W", min=0, help="End after so many seconds (1 if too few)."),
+        typer.Option(
+            "--timeout",
+            "-W",
+            min=0,
+            help="End after so many seconds; exit code 1 if messages are missing.",
+        ),
     ] = None,
     qos: Annotated[int, typer.Option("--qos", "-q", min=0, max=2)] = 0,
 ) -> None:
-    """Subscribe, and print what comes, a message a line."""
+    """Subscribe, and print received messages, one per line."""
     from appliance.cli import mqtt_client as client
 
     try:

@@ -1,4 +1,4 @@
-"""The broker that a command connects to, and the robot that it means: the options that say so."""
+"""Options of commands that connect to a broker, or that call a robot."""
 
 from __future__ import annotations
 
@@ -22,23 +22,27 @@ _HERE = "localhost"
 
 @dataclass(frozen=True)
 class ConnectionOptions:
-    """The options of a command that connects; what none says is the configuration's, if any."""
+    """Options of a command that connects; the configuration has the defaults, if there is one."""
 
     host: Annotated[str, typer.Option("--host", "-H", help="The broker's name or address.")] = _HERE
     port: Annotated[
         int | None,
         typer.Option(
-            "--port", "-p", min=1, max=65535, help="Else the TLS listener's of the configuration."
+            "--port", "-p", min=1, max=65535, help="Default: the TLS listener of the configuration."
         ),
     ] = None
     ca: Annotated[
         Path | None,
-        typer.Option("--ca", metavar="FILE", help="The robot's ca.crt; else the configuration's."),
+        typer.Option(
+            "--ca", metavar="FILE", help="The robot's ca.crt; default: from the configuration."
+        ),
     ] = None
     cert: Annotated[
         Path | None,
         typer.Option(
-            "--cert", metavar="FILE", help="A client certificate, with its key in it or in:"
+            "--cert",
+            metavar="FILE",
+            help="A client certificate; its key is in the same file or in --key.",
         ),
     ] = None
     key: Annotated[
@@ -46,18 +50,18 @@ class ConnectionOptions:
         typer.Option("--key", metavar="FILE", help="The key of the client certificate."),
     ] = None
     user: Annotated[
-        str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="Who to be.")
+        str | None, typer.Option("--user", "-u", envvar="APPLIANCE_USER", help="The user name.")
     ] = None
     password_file: Annotated[
         str | None,
         typer.Option(
             "--password-file",
             metavar="FILE",
-            help="Its first line is the password; else APPLIANCE_PASSWORD; else it is asked for.",
+            help="File whose first line is the password; default: APPLIANCE_PASSWORD, or a prompt.",
         ),
     ] = None
     client_id: Annotated[
-        str, typer.Option("--id", "-i", help="The client id; else a random one.")
+        str, typer.Option("--id", "-i", help="The client id; default: a random one.")
     ] = ""
     mqtt_version: Annotated[
         Literal["5", "311"], typer.Option("--mqtt-version", "-V", help="MQTT 5 or 3.1.1.")
@@ -65,20 +69,20 @@ class ConnectionOptions:
     insecure: Annotated[
         bool,
         typer.Option(
-            "--insecure", help="Do not check who the broker is. Never with a real password."
+            "--insecure", help="Do not verify the broker's certificate. Never with a real password."
         ),
     ] = False
     config: ConfigOption = None
 
     def target(self) -> ConnectionSettings:
-        """Where to connect and as whom; asks for the password if it has to. Raises CommandError."""
+        """The connection settings; asks for the password if necessary. Raises CommandError."""
         from paho.mqtt.enums import MQTTProtocolVersion
 
         from appliance.cli.mqtt_client import ConnectionSettings
 
         port, ca = self.port, self.ca
-        # Of an appliance on this computer the configuration says the rest. Without one it is a
-        # client on some other computer: the options say everything.
+        # The configuration of an appliance on this computer has the defaults. Without one this is
+        # a client on another computer, and only the options count.
         is_own = ca is None and (port is None or self.host == _HERE) and _is_configured()
         if self.config or is_own:
             broker = load(self.config).broker
@@ -115,18 +119,20 @@ class ConnectionOptions:
 
 @dataclass(frozen=True)
 class CallTarget(ConnectionOptions):
-    """The options of a command that is about a robot."""
+    """Options of a command that calls a robot."""
 
     robot: Annotated[
         str | None,
-        typer.Option(help="The robot, the first level of its topics; else the configuration's."),
+        typer.Option(
+            help="The robot, the first level of its topics; default: from the configuration."
+        ),
     ] = None
 
     def topic(self, name: str) -> str:
-        """Where a service, an action or a node is on MQTT: `/arm/grip` is `r2d2/arm/grip`."""
+        """The MQTT topic of a service, an action or a node: `/arm/grip` is `r2d2/arm/grip`."""
         if not name.startswith("/"):
             return name
-        # Of ROS 1, parameters may be at the top: those of /.
+        # In ROS 1, parameters may be at the top level: those of /.
         return f"{self.robot or self._configured()}{name.rstrip('/')}"
 
     def _configured(self) -> str:
@@ -144,7 +150,7 @@ def _is_configured() -> bool:
 
 
 def connecting(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options that its first argument, a `ConnectionOptions`, is made of."""
+    """Replace the first argument, a `ConnectionOptions`, by the options that it consists of."""
     first, *own = inspect.signature(command, eval_str=True).parameters.values()
     options = inspect.signature(first.annotation, eval_str=True).parameters
 

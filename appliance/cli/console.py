@@ -1,4 +1,4 @@
-"""What the commands share: their errors, options that several have, and secrets that are typed."""
+"""Shared by the commands: errors, common options, passwords and tables."""
 
 from __future__ import annotations
 
@@ -19,28 +19,30 @@ ConfigOption = Annotated[
         "--config",
         "-c",
         metavar="FILE",
-        help="The configuration; else ./appliance.yaml, else that in /etc/appliance.",
+        help="The configuration; default: ./appliance.yaml, then that in /etc/appliance.",
     ),
 ]
 PasswordFileOption = Annotated[
     str | None,
-    typer.Option(metavar="FILE", help="Take the password from this file's first line; - is stdin."),
+    typer.Option(
+        metavar="FILE", help="Read the password from the first line of this file; - is stdin."
+    ),
 ]
 GenerateOption = Annotated[
-    bool, typer.Option("--generate", help="Make a random password, and show it once.")
+    bool, typer.Option("--generate", help="Generate a random password, and show it once.")
 ]
 
 
-#: Of the line that a password is read from: in MQTT it has at most 65,535 bytes.
-LONGEST_PASSWORD = 65_536
+#: Limit on the line that a password is read from; MQTT allows at most 65,535 bytes.
+MAX_PASSWORD_LENGTH = 65_536
 
 
 class CommandError(Exception):
-    """Told to the user as it is; the command ends with exit code 1."""
+    """Its message is printed as it is; the command ends with exit code 1."""
 
 
 def load(config: Path | None) -> Settings:
-    """The settings; CommandError when they cannot be used."""
+    """The settings. Raises CommandError when they are invalid."""
     from appliance.config import ConfigError
     from appliance.config import load as load_settings
 
@@ -51,13 +53,13 @@ def load(config: Path | None) -> Settings:
 
 
 def new_password(whose: str, file: str | None, generate: bool) -> str:
-    """A password that is to be: made, read from a file or asked for, never on the command line."""
+    """A new password: generated, read from a file or asked for, never from the command line."""
     if generate and file:
         raise typer.BadParameter("--generate and --password-file exclude each other")
     from appliance.host.owners import acting_as_caller
 
     if generate:
-        with acting_as_caller():  # Python may be where only root can read
+        with acting_as_caller():  # Python may be in a directory that only root can read
             from appliance.ops.init import generate_password
 
         return generate_password()
@@ -79,16 +81,16 @@ def read_password(file: str) -> str:
             acting_as_caller(),
             nullcontext(sys.stdin) if file == "-" else Path(file).open(encoding="utf-8") as opened,
         ):
-            line = opened.readline(LONGEST_PASSWORD + 1)
+            line = opened.readline(MAX_PASSWORD_LENGTH + 1)
     except UnicodeDecodeError:
         raise CommandError(f"{file}: this is no password: it is not UTF-8 text") from None
-    if len(line) > LONGEST_PASSWORD:
+    if len(line) > MAX_PASSWORD_LENGTH:
         raise CommandError(f"{file}: its first line is too long for a password: is it the file?")
     return line.rstrip("\r\n")
 
 
 def shown(path: Path) -> str:
-    """The path as a user of this folder would type it."""
+    """The path, relative to the current directory if it is inside."""
     try:
         return str(path.absolute().relative_to(Path.cwd()))
     except ValueError:
@@ -96,7 +98,7 @@ def shown(path: Path) -> str:
 
 
 def print_table(rows: Iterable[tuple[str, ...]]) -> None:
-    """In columns as wide as they have to be: a program that reads them misses nothing."""
+    """Print columns as wide as necessary: nothing is cut off for programs that read them."""
     lines = list(rows)
     columns = max(map(len, lines), default=0)
     padded = [(*row, *[""] * (columns - len(row))) for row in lines]

@@ -1,4 +1,4 @@
-"""`appliance demo`: the appliance beside a demo robot, and what to type to see and drive it."""
+"""`appliance demo`: runs the appliance with a demo robot, and prints commands to drive it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from appliance.ops.control import ControlError, ask
 from appliance.ops.init import PASSWORD_FILE
 from appliance.ros.ros2.installation import is_frozen
 
-RESET = "/reset"  # the demo robot's service, which the demo's configuration bridges
-STOP_TIMEOUT = 5.0  # seconds that the robot has to end by itself
+RESET = "/reset"  # a service of the demo robot that the demo's configuration bridges
+STOP_TIMEOUT = 5.0  # seconds until the robot is killed
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -33,7 +33,7 @@ class DemoError(Exception):
 
 
 def run(settings: Settings) -> int:
-    """Runs broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
+    """Run broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
     if not any(listener.is_mqtts for listener in settings.broker.listeners):
         raise DemoError("the demo needs a listener with tls: true")
     with contextlib.suppress(ControlError):
@@ -51,7 +51,7 @@ async def _main(settings: Settings) -> None:
 
 
 class Demo(App):
-    """The appliance with a demo robot beside it, which starts and stops with it."""
+    """The appliance with a demo robot that starts and stops with it."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(settings)
@@ -59,7 +59,7 @@ class Demo(App):
         self._watching: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Starts everything, then says what to type. Raises what App.start raises."""
+        """Start everything, then print instructions. Raises what App.start raises."""
         await super().start()
         self._robot = await _start_robot(self.settings)
         if self._robot is not None:
@@ -73,7 +73,7 @@ class Demo(App):
                 break
 
     async def stop(self) -> None:
-        """Stops the robot, then the appliance; may be called twice."""
+        """Stop the robot, then the appliance; may be called twice."""
         if self._watching is not None:
             self._watching.cancel()
         if self._robot is not None:
@@ -103,12 +103,12 @@ async def _start_robot(settings: Settings) -> Process | None:
             "demo robot: the broker runs alone."
         )
         return None
-    libc = ctypes.CDLL(None)  # before the fork: nothing may be loaded after it
+    libc = ctypes.CDLL(None)  # loaded before the fork: after it nothing may be loaded
     return await asyncio.create_subprocess_exec(
         sys.executable,
         "-m",
         "appliance.cli.demo_robot",
-        # The robot must not drive on when this process is killed.
+        # The robot must end when this process is killed.
         preexec_fn=lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM),
     )
 
@@ -129,7 +129,7 @@ async def _stop(robot: Process) -> None:
 
 
 def instructions(settings: Settings, host: str, port: int) -> str:
-    """What to type in another terminal to see and drive the robot."""
+    """Commands for another terminal to see and drive the robot."""
     directory = (settings.file or Path("appliance.yaml")).parent
     user = next(iter(Passwords.load(settings.broker.users).users()), "USER")
     password = directory / PASSWORD_FILE
@@ -168,7 +168,7 @@ Ctrl-C here ends everything.
 
 
 def _quoted(path: Path) -> str:
-    """The path as it is typed in the current folder."""
+    """The path relative to the current directory, quoted for a shell."""
     try:
         path = path.absolute().relative_to(Path.cwd())
     except ValueError:

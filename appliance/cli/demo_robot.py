@@ -1,9 +1,9 @@
 """A small robot to try the bridge with: `python -m appliance.cli.demo_robot`.
 
-It drives as `/cmd_vel` says and stops by itself when it has not been told anything for a second. It
-publishes `/odom`, `/battery`, `/scan`, `/chatter` and, once and kept for late comers,
-`/robot_description`. The service `/reset` (std_srvs/srv/Trigger) puts it back to its start. Units
-as in REP 103: m, rad, s, V. SIGTERM and SIGINT stop it.
+It follows `/cmd_vel` and stops when no command has come for a second. It publishes `/odom`,
+`/battery`, `/scan`, `/chatter` and, latched, `/robot_description`. The service `/reset`
+(std_srvs/srv/Trigger) puts it back to its start. Units as in REP 103: m, rad, s, V. SIGTERM and
+SIGINT stop it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ DESCRIPTION = """<robot name="demo">
 
 
 class Drive:
-    """Where a robot with two wheels is, `x` and `y` in m and `heading` in rad, and its speed."""
+    """Position of a robot with two wheels, `x` and `y` in m and `heading` in rad, and its speed."""
 
     def __init__(self) -> None:
         self.x = self.y = self.heading = 0.0
@@ -54,13 +54,13 @@ class Drive:
         self._commanded_at = -math.inf
 
     def command(self, linear: float, angular: float, now: float) -> None:
-        """Drive at `linear` m/s and `angular` rad/s; what is not a finite number stops."""
+        """Drive at `linear` m/s and `angular` rad/s; a value that is not finite stops the robot."""
         finite = math.isfinite(linear) and math.isfinite(angular)
         self.linear, self.angular = (linear, angular) if finite else (0.0, 0.0)
         self._commanded_at = now
 
     def advance(self, seconds: float, now: float) -> None:
-        """Move on; without a command for COMMAND_TIMEOUT the robot stands."""
+        """Advance the simulation; without a command for COMMAND_TIMEOUT the robot stops."""
         if now - self._commanded_at > COMMAND_TIMEOUT:
             self.linear = self.angular = 0.0
         middle = self.heading + self.angular * seconds / 2
@@ -72,7 +72,7 @@ class Drive:
     def scan(self) -> list[float]:
         """The distances in m to the walls of the room, counter-clockwise from straight ahead.
 
-        The room moves along when the robot leaves it, so that there is always something to see.
+        The room moves along when the robot leaves it, so that walls are always in sight.
         """
         half = ROOM / 2
         x = (self.x + half) % ROOM - half
@@ -88,12 +88,12 @@ class Drive:
 
 
 class DemoRobot:
-    """The ROS node; everything in it happens on the executor's thread."""
+    """The ROS node; all callbacks run on the executor's thread."""
 
     def __init__(self, node: Any) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 
-        # By name, as these packages come without types for mypy.
+        # Imported by name, because these packages have no types for mypy.
         self._types = {name: import_message(name) for name in TYPES}
         twist, odometry, battery, scan, string = self._types.values()
         self._node = node
@@ -162,7 +162,7 @@ class DemoRobot:
         message.percentage = charge
         message.present = True
         message.power_supply_status = message.POWER_SUPPLY_STATUS_DISCHARGING
-        # What is not measured is NaN, as the message's definition wants it.
+        # Values that are not measured are NaN, as the message definition requires.
         message.current = message.charge = message.capacity = math.nan
         message.design_capacity = message.temperature = math.nan
         self._battery.publish(message)

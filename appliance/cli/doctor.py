@@ -1,4 +1,4 @@
-"""The command itself: what is found, a line each, for people or for machines."""
+"""The command `appliance doctor`: prints findings, one per line, as text or JSON."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ _WORDS = {"ok": "ok", "warning": "warning", "error": "problem"}
 
 def doctor(
     config: ConfigOption = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One line of JSON a finding.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a line of JSON per finding.")
+    ] = False,
 ) -> None:
-    """Look at all that the appliance needs, change nothing, and say what to do.
+    """Check all that the appliance needs, without changing anything, and advise.
 
-    At ports, clock, certificates, disk, permissions, memory and ROS. The exit
-    code is 1 when there is a problem.
+    Checks ports, clock, certificates, disk, permissions, memory and ROS. The
+    exit code is 1 when there is a problem.
     """
     from appliance.ops.doctor.examination import examine
 

@@ -1,4 +1,4 @@
-"""`appliance fastdds`: the file that gives ROS nodes the memory that images take."""
+"""`appliance fastdds`: a Fast DDS profile with shared memory large enough for images."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ from typing import Annotated
 
 import typer
 
-#: Bytes that a segment may have: no less than is the default, and no more than a shared memory has.
+#: Smallest and largest segment in bytes: the default, and the most that shared memory allows.
 LEAST, MOST = 512 << 10, 4 << 30
 
 
 def fastdds(
     segment: Annotated[
         str,
-        typer.Option(metavar="SIZE", help="Memory for what a node publishes: several messages."),
+        typer.Option(
+            metavar="SIZE", help="Shared memory of each node; several messages should fit."
+        ),
     ] = "16 MiB",
 ) -> None:
-    """Print the file by which nodes share more memory, for those that publish images."""
+    """Print a Fast DDS profile with more shared memory, for nodes that publish images."""
     from appliance.config import parse_size
     from appliance.ros.ros2.fastdds import VARIABLES, profile
 

@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 RootOption = Annotated[
     Path,
-    typer.Option("--root", metavar="DIR", envvar="DESTDIR", help="In this image of a system."),
+    typer.Option("--root", metavar="DIR", envvar="DESTDIR", help="Install into this system image."),
 ]
 DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")
+    bool, typer.Option("--dry-run", help="Print what would be done, and do nothing.")
 ]
 
 
 def install(
     robot: Annotated[
-        str | None, typer.Option(help="The robot's name; else this computer's.")
+        str | None, typer.Option(help="The robot's name; default: this computer's name.")
     ] = None,
     user: Annotated[
         str | None,
         typer.Option(
-            help="Run as this user: the one of the ROS nodes shares its memory with them. Else the "
-            "one that it ran as before, or its own, appliance."
+            help="Run as this user: the user of the ROS nodes shares memory with them. Default: "
+            "the user as before, or its own user, appliance."
         ),
     ] = None,
     start: Annotated[
@@ -41,20 +41,20 @@ def install(
         bool,
         typer.Option(
             "--init/--no-init",
-            help="Make keys and a first user where there are none; not for an image that several "
-            "robots get.",
+            help="Make keys and a first user where there are none; not for an image that is "
+            "copied to several robots.",
         ),
     ] = True,
     dry_run: DryRunOption = False,
     root: RootOption = Path("/"),
     packaged: Annotated[bool, typer.Option("--packaged", hidden=True)] = False,
 ) -> None:
-    """Make this a service that systemd keeps running; run again, it upgrades it.
+    """Install the appliance as a systemd service, or upgrade the installed one.
 
     The command goes to /usr/local/bin, configuration and keys to
-    /etc/appliance, data to /var/lib/appliance. What is there of configuration,
-    keys and data is kept. If the new version does not start, the one before
-    runs on.
+    /etc/appliance, data to /var/lib/appliance. Existing configuration, keys
+    and data are not changed. If the new version does not start, the previous
+    one continues to run.
     """
     from appliance.access import AccessFileError
     from appliance.certs import CertificateError
@@ -99,7 +99,7 @@ def uninstall(
     dry_run: DryRunOption = False,
     root: RootOption = Path("/"),
 ) -> None:
-    """Stop the service and take it away; configuration, keys and data stay."""
+    """Stop and remove the service; configuration, keys and data stay."""
     from appliance.ops.install import InstallError
 
     installation = _installation(root, dry_run)

@@ -1,7 +1,7 @@
 """The command `appliance`.
 
-Imports are inside the commands, so that `--help` and `pub` do not wait for what they do not use.
-Exit codes: 0 done, 1 refused or failed (the reason is on standard error), 2 wrong usage.
+Imports are inside the commands, so that `--help` and `pub` start fast.
+Exit codes: 0 success, 1 refused or failed (the reason is on standard error), 2 wrong usage.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="The robot's MQTT broker, with the bridge to ROS inside it.",
 )
-# In the order of the help.
+# In this order in the help.
 SETTING_UP = (init, run, check, reload)
 LOOKING = (status, doctor, routes)
 USING = (pub, sub, call, goal)
@@ -49,7 +49,7 @@ for name, group in GROUPS.items():
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Runs the command and exits with its code; what a user can mend is told in plain words."""
+    """Run the command and exit with its code; errors that users can fix have no traceback."""
     _open_standard_streams()
     given = sys.argv[1:] if arguments is None else arguments
     given, ros_arguments = _split_ros_arguments(given)
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         app(args=given, prog_name="appliance", obj=ros_arguments)
     except CommandError as error:
         typer.secho(f"appliance: {error}", fg="red", err=True)
-    except BrokenPipeError:  # `appliance sub … | head`: the reader has enough
+    except BrokenPipeError:  # `appliance sub … | head`: the reader has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except KeyboardInterrupt:
@@ -70,7 +70,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _open_standard_streams() -> None:
-    """Nothing else gets their numbers, such as the database, which C libraries would write to."""
+    """Open missing ones, so that no file gets their descriptors, which C libraries write to."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             os.dup2(os.open(os.devnull, os.O_RDWR), number)
@@ -78,7 +78,7 @@ def _open_standard_streams() -> None:
 
 
 def _split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Those of the command, and those between `--ros-args` and `--`, as ROS tools add them."""
+    """The command's arguments, and those between `--ros-args` and `--`, which ROS tools add."""
     ours: list[str] = []
     ros: list[str] = []
     to = ours

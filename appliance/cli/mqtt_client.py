@@ -1,4 +1,4 @@
-"""`appliance pub` and `appliance sub`: the command line's own MQTT client, on paho-mqtt and TLS."""
+"""The MQTT client of the command line, for `appliance pub`, `sub` and calls: paho-mqtt over TLS."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from appliance.ops.logs import VISIBLE, VISIBLE_IN_LINES
 
-ANSWER_TIMEOUT = 10.0  # seconds to wait for the broker's answer to a packet that needs one
+ANSWER_TIMEOUT = 10.0  # seconds to wait for an acknowledgement
 
 
 class ClientError(Exception):
-    """The broker could not be reached, or refused; the message says what and why."""
+    """The broker is unreachable or refused a request; the message says what and why."""
 
 
 class RefusedError(ClientError):
-    """The broker refused it; the message says what and, if the broker said so, why.
+    """The broker refused a request; the message has the broker's reason, if it gave one.
 
-    `by_rules` is whether its access rules may be the reason.
+    `by_rules`: its access rules may be the reason.
     """
 
     def __init__(self, message: str, *, by_rules: bool) -> None:
@@ -37,37 +37,37 @@ class RefusedError(ClientError):
         self.by_rules = by_rules
 
     def advised(self, advice: str) -> RefusedError:
-        """With what to do about access rules, where these may be the reason."""
+        """The same error, with advice on access rules if these may be the reason."""
         return RefusedError(f"{self}. {advice}", by_rules=True) if self.by_rules else self
 
 
 @dataclass(frozen=True)
 class BrokerReply:
-    """What the broker said of a packet: a code and, in MQTT 5, perhaps why."""
+    """The broker's answer to a packet: a reason code and, in MQTT 5, perhaps a reason string."""
 
     code: ReasonCode
     properties: Properties | None
 
     def __str__(self) -> str:
-        """In words, without what could command a terminal."""
+        """As text, without control characters for a terminal."""
         return f"{self.code}: {self.why}" if self.why else str(self.code)
 
     @property
     def why(self) -> str:
-        """The server's reason string, if it gave one."""
+        """The reason string, or an empty string."""
         return str(getattr(self.properties, "ReasonString", "")).translate(VISIBLE)
 
     @property
     def may_be_rules(self) -> bool:
-        """Whether it may be access rules that refuse it; 3.1.1 has one code for everything."""
+        """Whether access rules may be the reason; MQTT 3.1.1 has one code for all refusals."""
         return self.code.value in (0x80, 0x87)
 
 
 @dataclass(frozen=True)
 class ConnectionSettings:
-    """Which broker to talk to, how its certificate is checked, and as whom.
+    """The broker's address, how its certificate is verified, and the client's credentials.
 
-    `certificate` is the client's own, with its key in the same file or in `key`.
+    `certificate` is the client's own; its key is in the same file or in `key`.
     """
 
     host: str
@@ -89,7 +89,7 @@ class ConnectionSettings:
 def publish(
     target: ConnectionSettings, topic: str, payloads: Iterable[bytes], qos: int, retain: bool
 ) -> None:
-    """Publishes each payload and waits for its acknowledgement. Raises ClientError."""
+    """Publish each payload and wait for its acknowledgement. Raises ClientError."""
     connection = MqttClient(target)
     try:
         for payload in payloads:
@@ -108,9 +108,9 @@ def subscribe(
     count: int | None = None,
     timeout: float | None = None,
 ) -> int:
-    """Writes messages to `output`, one a line, and returns how many there were.
+    """Write received messages to `output`, one per line; returns their number.
 
-    Ends after `count` messages or `timeout` seconds, whichever is first; without either it goes on
+    Ends after `count` messages or `timeout` seconds, whichever is first; without either it runs
     until interrupted. Raises ClientError, also when the broker ends the connection.
     """
     received = 0
@@ -136,7 +136,7 @@ def subscribe(
 
 
 def write_line(output: BinaryIO, line: bytes) -> None:
-    """Writes it as it is, or so that a payload cannot send commands to a terminal."""
+    """Write a line unchanged, except to a terminal, where control characters are escaped."""
     if output.isatty():
         line = line.decode(errors="backslashreplace").translate(VISIBLE_IN_LINES).encode()
     output.write(line + b"\n")
@@ -144,7 +144,7 @@ def write_line(output: BinaryIO, line: bytes) -> None:
 
 
 class MqttClient:
-    """One connection, driven by the caller's thread; every failure is a ClientError."""
+    """One connection, driven by the calling thread; every failure is a ClientError."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class MqttClient:
         client.on_message = lambda c, u, message: on_message(message)
         context = _tls(target)
         if target.certificate is not None:
-            _show_certificate(context, target.certificate, target.key)
+            _load_certificate(context, target.certificate, target.key)
         client.tls_set_context(context)
         client.tls_insecure_set(target.insecure)
         self._connect()
@@ -216,8 +216,8 @@ class MqttClient:
         retain: bool,
         properties: Properties | None = None,
     ) -> ReasonCode:
-        """Publishes, and returns what the broker said of it when it has taken it (QoS 0: when it
-        was sent). Raises RefusedError."""
+        """Publish, and return the reason code of the acknowledgement (QoS 0: return when it was
+        sent). Raises RefusedError."""
         try:
             message = self._client.publish(topic, payload, qos, retain, properties)
         except ValueError as error:
@@ -225,16 +225,16 @@ class MqttClient:
         self._wait(lambda: message.mid in self._published, "a message")
         answer = self._published.pop(message.mid)
         if answer.code.is_failure:
-            # Of QoS 2 the library tells the end alone, and not the PUBREC that says why.
+            # For QoS 2, paho reports only the end, and not the PUBREC with the reason string.
             hint = " (--qos 1 tells why)" if qos == 2 and not answer.why else ""
             text = f"{topic!r} was refused: {answer}{hint}"
             raise RefusedError(text, by_rules=answer.may_be_rules)
         return answer.code
 
     def subscribe(self, filters: list[str], qos: int, *, retained: bool = True) -> None:
-        """Subscribes to all of the filters; with MQTT 5 also without what is retained there.
+        """Subscribe to all filters; `retained=False` skips retained messages, in MQTT 5 only.
 
-        Raises RefusedError that names those refused.
+        Raises RefusedError that names the refused filters.
         """
         handling = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
         if not retained:
@@ -262,8 +262,8 @@ class MqttClient:
     def run(
         self, done: Callable[[], bool], deadline: float | None = None, step: float = 1.0
     ) -> bool:
-        """Works until `done()` or the deadline (monotonic clock); returns `done()`, which is asked
-        when something has come, and every `step` seconds."""
+        """Run the network loop until `done()` or the deadline (monotonic clock); returns `done()`,
+        which is called after received data and every `step` seconds."""
         while not done():
             left = step if deadline is None else min(step, deadline - time.monotonic())
             if left <= 0:
@@ -282,14 +282,14 @@ class MqttClient:
             raise ClientError(f"{self._target.address} gave no answer to {what}")
 
     def close(self) -> None:
-        """Says goodbye and closes; harmless when the connection is gone already."""
+        """Send DISCONNECT and close; does nothing when the connection is closed already."""
         self._client.disconnect()
 
 
 def _reason(error: ssl.SSLError) -> str:
-    """What OpenSSL says, without the line of Python's source that it came by."""
-    said = error.reason or re.sub(r"^\[SSL\] | \(_ssl\.c:\d+\)$", "", str(error.args[-1]))
-    return said.lower().replace("_", " ")
+    """OpenSSL's reason, without the position in Python's source."""
+    reason = error.reason or re.sub(r"^\[SSL\] | \(_ssl\.c:\d+\)$", "", str(error.args[-1]))
+    return reason.lower().replace("_", " ")
 
 
 def _tls(target: ConnectionSettings) -> ssl.SSLContext:
@@ -299,7 +299,7 @@ def _tls(target: ConnectionSettings) -> ssl.SSLContext:
         context.verify_mode = ssl.CERT_NONE
         return context
     try:
-        # With a CA given, only that one counts: a public one has no say about a robot.
+        # A given CA is the only trusted one: a public CA must not vouch for a robot.
         return ssl.create_default_context(cafile=str(target.ca) if target.ca else None)
     except ssl.SSLError:
         raise ClientError(f"{target.ca} is not a CA certificate in PEM form") from None
@@ -307,7 +307,7 @@ def _tls(target: ConnectionSettings) -> ssl.SSLContext:
         raise ClientError(f"{target.ca} cannot be read: {error.strerror}") from None
 
 
-def _show_certificate(context: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
+def _load_certificate(context: ssl.SSLContext, certificate: Path, key: Path | None) -> None:
     def no_password() -> str:
         raise ClientError(f"{key or certificate} is encrypted; take its password off first")
 

@@ -1,4 +1,4 @@
-"""`appliance routes`: what is carried between ROS and MQTT, and what is not."""
+"""`appliance routes`: what is bridged between ROS and MQTT, and what is skipped."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from appliance.cli.console import CommandError, ConfigOption, load, print_table
 
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")
-FIGURES = ("HZ", "BYTES", "LOST", "DROPPED", "SLOW", "THROTTLED", "REFUSED", "ERRORS", "MS")
+METRICS = ("HZ", "BYTES", "LOST", "DROPPED", "SLOW", "THROTTLED", "REFUSED", "ERRORS", "MS")
 
-#: In the summary, by what `why` says.
+#: Texts of the summary, by the value of `why`.
 WHY = {
     "problem": "cannot be set up",
     "absent": "not there",
@@ -25,7 +25,7 @@ WHY = {
     "of_every_node": "that every node has",
 }
 
-#: Lines of what is skipped, unless all are asked for; and what is then only counted.
+#: Skipped entries that are listed without --all, and the reason that is then only counted.
 SHOWN = 20
 COUNTED = "of_every_node"
 
@@ -34,13 +34,15 @@ def routes(
     config: ConfigOption = None,
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="A line of JSON an entry; of what is skipped only with --all."),
+        typer.Option(
+            "--json", help="Print a line of JSON per entry; skipped entries only with --all."
+        ),
     ] = False,
     show_all: Annotated[
-        bool, typer.Option("--all", help=f"All that is skipped, not the first {SHOWN} only.")
+        bool, typer.Option("--all", help=f"List all skipped entries, not only the first {SHOWN}.")
     ] = False,
 ) -> None:
-    """Show what the running appliance carries between ROS and MQTT, and what not and why."""
+    """Show what the running appliance bridges between ROS and MQTT, and what it skips and why."""
     settings = load(config)
     from appliance.ops.control import ControlError, ask
 
@@ -55,7 +57,7 @@ def routes(
         return
     if bridged:
         rows = map(_row, sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
-        print_table([(*HEAD, *FIGURES), *rows])
+        print_table([(*HEAD, *METRICS), *rows])
         _print_errors(bridged)
         if any(entry.get("lost") for entry in bridged):
             from appliance.ros.ros2.fastdds import LOST_IN_ROS
@@ -71,7 +73,7 @@ def routes(
 def _row(entry: dict[str, Any]) -> tuple[str, ...]:
     way = entry["direction"]
     about = (entry["ros"], ARROWS.get(way, way), entry["mqtt"], entry["type"], entry["encoding"])
-    if way not in ARROWS:  # services, actions and parameters have no figures
+    if way not in ARROWS:  # services, actions and parameters have no metrics
         return about
     latency = entry["latency_ms"]
     counts = (entry[key] for key in ("size", "lost", "dropped", "skipped", "throttled"))
@@ -86,9 +88,9 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _print_errors(bridged: list[dict[str, Any]]) -> None:
-    """What was wrong with the last message of each route that was not carried."""
-    told = [entry for entry in bridged if entry.get("last_error")]
-    for entry in sorted(told, key=lambda entry: (entry["ros"], entry["direction"])):
+    """The last error of each route."""
+    failed = [entry for entry in bridged if entry.get("last_error")]
+    for entry in sorted(failed, key=lambda entry: (entry["ros"], entry["direction"])):
         way = ARROWS.get(entry["direction"], entry["direction"])
         typer.echo(f"{entry['ros']} {way}  last error: {entry['last_error']}")
 

@@ -1,7 +1,7 @@
-"""What `appliance call`, `goal` and `param` do: an MQTT client that calls.
+"""The RPC client of `appliance call`, `goal` and `param`, on top of the MQTT client.
 
-The answer to a call is asked for below the caller's own `_reply/{client id}`, which both versions
-of MQTT can and which takes no right to publish anywhere else.
+Response topics are below `_reply/{client id}`, which works in both versions of MQTT and needs no
+right to publish to other topics.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from appliance.cli.mqtt_client import (
 
 NO_MATCHING_SUBSCRIBERS = 0x10
 
-#: Seconds between two looks at whether the user wants to stop.
+#: Seconds between two checks of whether the user wants to stop.
 STEP = 0.1
 
-#: Seconds without a further message after which all retained ones have come.
+#: Seconds without a message after which all retained messages are assumed to have come.
 QUIET = 0.5
 
 
 class CallFailedError(ClientError):
-    """The answer is an error; the message says which and why."""
+    """The answer is an error; the message has its code and text."""
 
 
 @dataclass(frozen=True)
 class GoalOutcome:
-    """How a goal ended, `succeeded`, `canceled` or `aborted`, and the JSON of its result."""
+    """The final status of a goal, `succeeded`, `canceled` or `aborted`, and its result as JSON."""
 
     status: str
     result: bytes
@@ -54,7 +54,7 @@ class RpcClient:
     """A connection for calls. Every failure is a ClientError; `close` ends it."""
 
     def __init__(self, target: ConnectionSettings) -> None:
-        if not target.client_id:  # which has to be known: it is a level of the answers' topics
+        if not target.client_id:  # it has to be known: it is a level of the response topics
             target = replace(target, client_id=f"appliance-{secrets.token_hex(6)}")
         self._target = target
         self._is_v5 = target.version == MQTTProtocolVersion.MQTTv5
@@ -66,7 +66,7 @@ class RpcClient:
         self._connection.close()
 
     def call(self, topic: str, payload: bytes, timeout: float) -> bytes:
-        """The JSON of the answer to a call that begins with JSON; waits up to `timeout` seconds."""
+        """Call with a JSON payload; returns the answer as JSON. Waits up to `timeout` seconds."""
         above = topic.rpartition("/")[0]
         replies = f"{above}/_reply/{self._target.client_id}"
         self._listen(f"{replies}/#", replies.replace(self._target.client_id, "%c"))
@@ -74,12 +74,12 @@ class RpcClient:
         self._send(topic, token, payload, f"{replies}/{token}")
 
         def answer() -> paho.MQTTMessage | None:
-            # What could not be answered as it was asked for is told one level above.
+            # Errors about the response topic itself are answered one level above it.
             return self._take(lambda to: to in (replies, f"{replies}/{token}"))
 
         message = self._wait_for(answer, timeout)
         if message is None:
-            raise ClientError(f"no answer from {topic} within {timeout:g} s{self._perhaps()}")
+            raise ClientError(f"no answer from {topic} within {timeout:g} s{self._version_hint()}")
         value = decode(message)
         if isinstance(value, dict) and isinstance(value.get("error"), dict):
             error = value["error"]
@@ -120,7 +120,7 @@ class RpcClient:
                 f"`appliance routes` shows what is. {_as_ros_name(topic)}".rstrip()
             )
 
-    def _perhaps(self) -> str:
+    def _version_hint(self) -> str:
         if self._is_v5:
             return ""
         return "; MQTT 3.1.1 cannot tell whether nothing takes the call, or it was not allowed"
@@ -157,13 +157,13 @@ class RpcClient:
         is_over: Callable[[], bool],
         timeout: float | None,
     ) -> GoalOutcome:
-        """Sends a goal to the action at that MQTT topic and follows it to its end.
+        """Send a goal to the action at that MQTT topic and follow it to its end.
 
-        `accepted` is called with its id, `feedback` with each one's JSON. When `is_over()` or the
-        timeout, in seconds, comes first, the goal is cancelled. Raises CallFailedError when it is
-        refused, or its cancelling is.
+        `accepted` is called with the goal's id, `feedback` with each feedback as JSON. When
+        `is_over()` becomes true or `timeout` seconds have passed, the goal is cancelled. Raises
+        CallFailedError when the goal or its cancellation is refused.
         """
-        # Before the goal is sent, or the first feedback would be missed.
+        # Subscribe before the goal is sent, or the first feedback would be missed.
         topics = [f"{action}/_result/+"] + ([f"{action}/_feedback/+"] if feedback else [])
         try:
             self._connection.subscribe(topics, 1, retained=False)
@@ -179,8 +179,8 @@ class RpcClient:
 
         def work() -> bool:
             nonlocal result
-            waiting, self._received[:] = self._received[:], []
-            for message in waiting:
+            batch, self._received[:] = self._received[:], []
+            for message in batch:
                 if message.topic == f"{action}/_result/{id_}":
                     result = message
                 elif feedback is not None and message.topic == f"{action}/_feedback/{id_}":
@@ -205,8 +205,8 @@ class RpcClient:
             from appliance.ros.calls.goals import status_of
             from appliance.ros.payload.encodings.registry import RAW, named_encoding
 
-            wire = RAW[named_encoding(content_type(result)) or "cdr"]
-            return GoalOutcome(status_of(bytes(result.payload), wire), shown(result))
+            serialization = RAW[named_encoding(content_type(result)) or "cdr"]
+            return GoalOutcome(status_of(bytes(result.payload), serialization), shown(result))
         value = decode(result)
         if "error" in value:
             raise CallFailedError(f"{value['error']['code']}: {value['error']['message']}")
@@ -222,8 +222,7 @@ class RpcClient:
     # Parameters
 
     def parameters(self, topic_filter: str, timeout: float) -> dict[str, bytes]:
-        """The JSON of what is retained there, by topic; waits up to `timeout` seconds for the
-        first."""
+        """Retained values as JSON, by topic; waits up to `timeout` seconds for the first."""
         self._connection.subscribe([topic_filter], 1)
         self._connection.run(lambda: bool(self._received), time.monotonic() + timeout, STEP)
         if "+" in topic_filter:
@@ -235,7 +234,7 @@ class RpcClient:
 
 
 def _as_ros_name(topic: str) -> str:
-    """What was meant when a call's topic has nothing above what it calls: no robot; else ""."""
+    """A hint for a topic that lacks the robot, as if a ROS name had no slash; else ""."""
     name = topic.partition("/")[0]
     if "/_" not in topic or not topic.removeprefix(name).startswith("/_"):
         return ""
@@ -243,39 +242,39 @@ def _as_ros_name(topic: str) -> str:
 
 
 def content_type(message: paho.MQTTMessage) -> str | None:
-    """What the message says to be; None where it does not, as in MQTT 3.1.1."""
-    said = getattr(message.properties, "ContentType", None)
-    return said if isinstance(said, str) else None
+    """The content type of the message; None without one, as in MQTT 3.1.1."""
+    value = getattr(message.properties, "ContentType", None)
+    return value if isinstance(value, str) else None
 
 
 def decode(message: paho.MQTTMessage) -> Any:
-    """The value of JSON or CBOR. Raises ClientError."""
-    said, payload = content_type(message), bytes(message.payload)
-    if said != "application/cbor":
+    """Decode JSON or CBOR. Raises ClientError."""
+    named, payload = content_type(message), bytes(message.payload)
+    if named != "application/cbor":
         try:
             return orjson.loads(payload)
         except orjson.JSONDecodeError:
             pass
-    if said in (None, "application/cbor"):
+    if named in (None, "application/cbor"):
         from appliance.ros.payload.encodings import cbor
         from appliance.ros.payload.fallback import ConversionError
 
         with contextlib.suppress(ConversionError):
             return cbor.loads(payload)
-    raise ClientError(f"{message.topic} has something else than {said or 'JSON or CBOR'}")
+    raise ClientError(f"{message.topic} has something else than {named or 'JSON or CBOR'}")
 
 
 def shown(message: paho.MQTTMessage) -> bytes:
-    """The JSON of a message, or, for what has none, what it is."""
+    """The message as JSON, or a description when it cannot be decoded."""
     try:
         return encode(decode(message))
     except ClientError:
-        said = content_type(message) or "of an unknown encoding"
-        return f"({said}, {len(message.payload)} bytes)".encode()
+        kind = content_type(message) or "of an unknown encoding"
+        return f"({kind}, {len(message.payload)} bytes)".encode()
 
 
 def encode(value: Any) -> bytes:
-    """One line of JSON; bytes, which CBOR has, as base64."""
+    """One line of JSON; byte strings of CBOR become base64."""
 
     def to_base64(value: object) -> str:
         if isinstance(value, bytes):

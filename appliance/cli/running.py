@@ -14,25 +14,27 @@ from appliance.cli.console import CommandError, ConfigOption, load, shown
 
 def init(
     directory: Annotated[
-        Path, typer.Option("--dir", metavar="DIR", help="Where everything goes.")
+        Path, typer.Option("--dir", metavar="DIR", help="The directory for all files.")
     ] = Path(),
     robot: Annotated[
-        str | None, typer.Option(help="The robot's name; else this computer's.")
+        str | None, typer.Option(help="The robot's name; default: this computer's name.")
     ] = None,
     user: Annotated[str, typer.Option(help="The first user's name.")] = "operator",
     demo: Annotated[
         bool,
-        typer.Option("--demo", help="With routes for the demo robot, and the password in a file."),
+        typer.Option(
+            "--demo", help="Add routes for the demo robot, and write the password to a file."
+        ),
     ] = False,
     name: Annotated[
         list[str] | None,
         typer.Option(
             metavar="DNS_NAME",
-            help="Under which clients reach it too, beside this computer's own. Repeatable.",
+            help="A further name that clients connect to, beside this computer's own. Repeatable.",
         ),
     ] = None,
 ) -> None:
-    """Make certificates, a first user, access rules and appliance.yaml; keep what is there."""
+    """Make certificates, a first user, access rules and appliance.yaml; existing files stay."""
     from appliance.access import AccessFileError
     from appliance.certs import CertificateError
     from appliance.config import ConfigError
@@ -59,14 +61,14 @@ def run(
     context: typer.Context,
     config: ConfigOption = None,
     log_format: Annotated[
-        Literal["human", "json"] | None, typer.Option(help="In place of log.format.")
+        Literal["human", "json"] | None, typer.Option(help="Overrides log.format.")
     ] = None,
     log_level: Annotated[
         Literal["debug", "info", "warning", "error"] | None,
-        typer.Option(help="In place of log.level."),
+        typer.Option(help="Overrides log.level."),
     ] = None,
 ) -> None:
-    """Run the appliance until SIGINT or SIGTERM; ROS arguments come behind `--ros-args`."""
+    """Run the appliance until SIGINT or SIGTERM; ROS arguments follow `--ros-args`."""
     settings = load(config)
     from appliance.app import main as app
     from appliance.ops import logs
@@ -79,19 +81,19 @@ def run(
 
 @contextmanager
 def _start_errors() -> Iterator[None]:
-    """What keeps the appliance from starting and a user can mend, as a CommandError."""
+    """Turn errors of the start that a user can fix into a CommandError."""
     from appliance.app.main import START_ERRORS
 
     try:
         yield
-    except OSError:  # told by main
+    except OSError:  # main reports it
         raise
     except START_ERRORS as error:
         raise CommandError(str(error)) from None
 
 
 def reload(config: ConfigOption = None) -> None:
-    """Have the running appliance take over its files as they are now: all of them, or none."""
+    """Make the running appliance apply its changed files: all of them, or none."""
     settings = load(config)
     from appliance.ops.control import ControlError, ask
 
@@ -105,10 +107,11 @@ def reload(config: ConfigOption = None) -> None:
 def check(
     config: ConfigOption = None,
     show: Annotated[
-        bool, typer.Option("--show", help="Also print every setting in force, secrets masked.")
+        bool,
+        typer.Option("--show", help="Also print all settings, with defaults; secrets are masked."),
     ] = False,
 ) -> None:
-    """Read everything that `run` would use, say what is found, and change nothing."""
+    """Check all files that `run` uses, without changing anything."""
     settings = load(config)
     from appliance.config import describe
     from appliance.ops.check import check as find
@@ -127,31 +130,31 @@ def check(
 
 
 def demo(config: ConfigOption = None) -> None:
-    """Run the appliance beside a demo robot, and print what to type to see and drive it."""
+    """Run the appliance with a demo robot, and print the commands to see and drive it."""
     settings = load(config)
-    from appliance.cli import demo as tour
+    from appliance.cli import demo as demo_appliance
     from appliance.ops import logs
 
     logs.setup(settings.log.level, settings.log.levels, settings.log.format)
     try:
         with _start_errors():
-            raise typer.Exit(tour.run(settings))
-    except tour.DemoError as error:
+            raise typer.Exit(demo_appliance.run(settings))
+    except demo_appliance.DemoError as error:
         raise CommandError(str(error)) from None
 
 
 def bench(
-    as_json: Annotated[bool, typer.Option("--json", help="For machines.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     cell: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this cell; may be repeated.")
+        list[str] | None, typer.Option(metavar="NAME", help="Only this cell. Repeatable.")
     ] = None,
     bridge: Annotated[bool, typer.Option("--bridge", help="Only the cells of the bridge.")] = False,
-    seconds: Annotated[float, typer.Option(help="How long each cell is measured.")] = 3.0,
+    seconds: Annotated[float, typer.Option(help="Seconds that each cell is measured.")] = 3.0,
     peer: Annotated[
-        str | None, typer.Option(metavar="PATH", help="The mosquitto to compare with.")
+        str | None, typer.Option(metavar="PATH", help="The mosquitto executable to compare with.")
     ] = None,
 ) -> None:
-    """Measure this broker, and mosquitto beside it where it is installed."""
+    """Measure this broker, and mosquitto for comparison if it is installed."""
     from appliance import bench
 
     cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]

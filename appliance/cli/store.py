@@ -11,12 +11,12 @@ from appliance.cli.console import CommandError, ConfigOption, load, print_table,
 
 HEAD = ("CLIENT ID", "USER", "SUBSCRIPTIONS", "MESSAGES", "BYTES", "OLDEST", "ENDS")
 
-store_app = typer.Typer(help="What outlives a restart.")
+store_app = typer.Typer(help="Sessions and messages that outlive a restart.")
 
 
 @store_app.callback(invoke_without_command=True)
 def store_show(context: typer.Context, config: ConfigOption = None) -> None:
-    """What outlives a restart: sessions, what waits for them, retained messages."""
+    """Show what outlives a restart: sessions, their queued messages, retained messages."""
     if context.invoked_subcommand is not None:
         return
     path, _ = _store_path(config)
@@ -58,7 +58,7 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
 
 @store_app.command("export")
 def store_export(config: ConfigOption = None) -> None:
-    """Print all of it as JSON, one session or retained message a line."""
+    """Print all of it as JSON, one session or retained message per line."""
     path, _ = _store_path(config)
     from appliance.ops.logs import json_text
     from appliance.store import StoreError
@@ -75,11 +75,13 @@ def store_export(config: ConfigOption = None) -> None:
 def store_prune(
     older_than: Annotated[
         str | None,
-        typer.Option(metavar="DURATION", help="Messages that wait for longer, such as 7 d."),
+        typer.Option(metavar="DURATION", help="Delete messages queued for longer, such as 7 d."),
     ] = None,
     client: Annotated[
         list[str] | None,
-        typer.Option(metavar="ID", help="Of this client only; else its whole session. Repeatable."),
+        typer.Option(
+            metavar="ID", help="Only of this client; alone: its whole session. Repeatable."
+        ),
     ] = None,
     retained: Annotated[
         list[str] | None,
@@ -87,10 +89,10 @@ def store_prune(
     ] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Delete sessions, what has waited too long for them, or retained messages, while the appliance
-    is stopped.
+    """Delete sessions, messages queued for too long, or retained messages, while the appliance is
+    stopped.
 
-    Retained messages of routes that are gone are taken back by the appliance itself.
+    The appliance itself deletes retained messages of removed routes.
     """
     if older_than is None and not client and not retained:
         raise typer.BadParameter("say what: --older-than, --client, both, or --retained")
@@ -121,7 +123,7 @@ def store_prune(
 
 
 def _store_path(config: Path | None) -> tuple[Path, Path | None]:
-    """The database, and the file that says so."""
+    """The database, and the configuration file that names it."""
     settings = load(config)
     store = settings.broker.store
     if store.durability == "off":

@@ -1,1 +1,1 @@
-"""How the one file and the Debian package are made, and what runs first in them."""
+"""Builds the single executable and the Debian package; `entry` is the executable's entry point."""

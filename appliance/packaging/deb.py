@@ -1,8 +1,8 @@
-"""Makes the Debian package of the single file: `make deb`.
+"""Builds the Debian package of the single executable: `make deb`.
 
-It does what `appliance install` does, and with the same code: dpkg owns the command, the unit and
-/etc/default/appliance, and `postinst` has the command make the rest. Keys and users are made on the
-robot, and are never in the package.
+The package does what `appliance install` does, with the same code: dpkg owns the command, the unit
+and /etc/default/appliance, and `postinst` lets the command make the rest. Keys and users are made
+on the robot, and are never in the package.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ DESCRIPTION = """\
 
 
 def build(command: Path, directory: Path) -> Path:
-    """The package of that executable, written to the directory."""
-    architecture = _said("dpkg", "--print-architecture")
+    """Build the package of that executable in the directory; returns its path."""
+    architecture = _output_of("dpkg", "--print-architecture")
     release = version("ros-mqtt-appliance").replace(".dev", "~dev").replace("rc", "~rc")
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
@@ -49,7 +49,7 @@ def build(command: Path, directory: Path) -> Path:
         _write(root, Path("/DEBIAN/control"), _control(root, release, architecture))
         directory.mkdir(exist_ok=True)
         package = directory / f"{PACKAGE}_{release}_{architecture}.deb"
-        # Its contents are compressed already, and unpacked at each start: gzip is quick.
+        # The executable is compressed already: fast gzip is enough.
         options = ("--root-owner-group", "-Zgzip", "-z1", "--build")
         subprocess.run(["dpkg-deb", *options, root, package], check=True, stdout=sys.stderr)
     return package
@@ -89,8 +89,8 @@ def _documents(root: Path, release: str) -> None:
 
 def _control(root: Path, release: str, architecture: str) -> str:
     size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) // 1024
-    # What was linked on this computer runs with its C library and with later ones.
-    libc = _said("getconf", "GNU_LIBC_VERSION").split()[-1]
+    # An executable linked on this computer needs its version of the C library or a later one.
+    libc = _output_of("getconf", "GNU_LIBC_VERSION").split()[-1]
     return (
         f"Package: {PACKAGE}\nVersion: {release}\nArchitecture: {architecture}\n"
         f"Maintainer: {_maintainer()}\nInstalled-Size: {size}\n"
@@ -106,14 +106,14 @@ def _maintainer() -> str:
 
 
 def _moment() -> float:
-    """When the newest commit was made, so that the same sources make the same package."""
+    """The time of the newest commit, so that the same sources give the same package."""
     try:
-        return float(_said("git", "-C", str(PROJECT), "log", "-1", "--format=%ct"))
+        return float(_output_of("git", "-C", str(PROJECT), "log", "-1", "--format=%ct"))
     except (OSError, ValueError, subprocess.CalledProcessError):
         return (PROJECT / "CHANGELOG.md").stat().st_mtime
 
 
-def _said(*command: str) -> str:
+def _output_of(*command: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 

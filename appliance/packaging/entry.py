@@ -1,7 +1,7 @@
-"""What the one file runs first: it makes the environment that ROS wants, and calls the command.
+"""Entry point of the single executable: sets up ROS's environment and runs the command.
 
-`appliance -m appliance.cli.demo_robot …` runs another of its programs, as Python's own option does,
-since for those that are started from within `sys.executable` is the one file.
+`appliance -m appliance.cli.demo_robot …` runs another module, like Python's own option: programs
+that are started from within use `sys.executable`, which is the single executable.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathlib import Path
 from appliance.host.environment import LIBRARIES, ORIGINAL_LIBRARIES
 from appliance.ros.ros2 import installation
 
-INSIDE = sys.prefix  # the folder that the file is unpacked to
+INSIDE = sys.prefix  # the directory that the executable is unpacked to
 PREFIXES = "AMENT_PREFIX_PATH"
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def main() -> None:
     use_ros()
-    keep_what_is_unpacked()
+    lock_unpacked_files()
     end_with_the_boot_loader()
     if sys.argv[1:2] == ["-m"] and sys.argv[2:]:
         module = sys.argv[2]
@@ -37,8 +37,8 @@ def main() -> None:
 
 
 def end_with_the_boot_loader() -> None:
-    """It waits to clear up behind this process, and who kills it means this one."""
-    import ctypes  # needs a library that is found only with the environment that use_ros makes
+    """End this process when its boot loader is killed, which waits for it to clean up."""
+    import ctypes  # needs a library that is found only in the environment of use_ros
 
     parent = os.getppid()
     try:
@@ -51,14 +51,14 @@ def end_with_the_boot_loader() -> None:
             sys.exit(1)
 
 
-def keep_what_is_unpacked() -> None:
-    """systemd-tmpfiles deletes what is old in /tmp, but not in a folder that is locked."""
+def lock_unpacked_files() -> None:
+    """Lock the directory: systemd-tmpfiles skips locked directories when it cleans /tmp."""
     with suppress(OSError):  # a file system without locks
         fcntl.flock(os.open(INSIDE, os.O_RDONLY | os.O_DIRECTORY), fcntl.LOCK_SH)
 
 
 def use_ros() -> None:
-    """Let the bundled ROS be found before the sourced one, or the other way round."""
+    """Set the search paths: the bundled ROS before the sourced one, or the other way round."""
     environment = os.environ
     prefixes = [path for path in _paths(PREFIXES) if path != INSIDE]
     libraries = _paths(ORIGINAL_LIBRARIES)
@@ -72,14 +72,14 @@ def use_ros() -> None:
     else:
         libraries.append(INSIDE)
         sys.path[:0] = [*python, str(sourced.site)]
-        # What a distribution's ROS asks of its Python, numpy for one, and may be missing here.
+        # A distribution's ROS imports modules of its Python, such as numpy, that this one may lack.
         version = f"/usr/lib/python{sys.version_info[0]}.{sys.version_info[1]}"
         sys.path += [version, f"{version}/lib-dynload", "/usr/lib/python3/dist-packages"]
     environment["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
     environment[PREFIXES] = os.pathsep.join(prefixes)
-    if not os.access(environment.get("HOME", ""), os.W_OK):  # where ROS wants to put its logs
+    if not os.access(environment.get("HOME", ""), os.W_OK):  # where ROS writes its logs
         environment.setdefault("ROS_LOG_DIR", f"{INSIDE}/log")
-    if _paths(LIBRARIES) != libraries:  # which is read when a program starts
+    if _paths(LIBRARIES) != libraries:  # the variable is read only when a program starts
         environment[LIBRARIES] = os.pathsep.join(libraries)
         os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
 
