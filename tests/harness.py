@@ -15,7 +15,7 @@ from waiting import PATIENCE
 from appliance import certs
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, Limits, Refusal
+from appliance.broker.ports import Action, Decision, Identity, Limits, Observer, Refusal
 from appliance.broker.session import Session
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
@@ -197,15 +197,12 @@ class Peer:
         abort(self.writer.transport)
 
 
-class PublishObserver:
+class PublishObserver(Observer):
     """Calls a function for each published message."""
 
     def __init__(self, harness: Harness, published: Callable[[Message], None]) -> None:
-        harness.broker.observer = self  # type: ignore[assignment]
+        harness.broker.observer = self
         self._published = published
 
     def published(self, session: Session, message: Message) -> None:
         self._published(message)
-
-    def disconnected(self, session: Session) -> None:
-        """Ignored."""

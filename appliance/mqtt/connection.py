@@ -173,6 +173,11 @@ class ServerProtocol:
         return self._have > 0 and self._reading
 
     @property
+    def has_unparsed(self) -> bool:
+        """Whether bytes are buffered that no event has been made of."""
+        return self._have > 0
+
+    @property
     def paused(self) -> bool:
         """Whether input is buffered until `accept` or `resume`."""
         return not self._reading and self.state is not State.CLOSED

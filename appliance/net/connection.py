@@ -484,10 +484,13 @@ class ClientConnection:
             return
         if self._login_result is not None:
             who, self._login_result = self._login_result, None
+            self._accounting.now = self._loop.time()
             # What the client sends because of the answer is not older than the answer. Once that
-            # is written, it cannot be distinguished from what has come during the login.
-            self.input_resumed()
-            self.input_paused()
+            # is written, it cannot be distinguished from what has come during the login: so check
+            # now whether anything has, unless some of it is buffered here already.
+            if not (self._client.protocol.has_unparsed or self._backlog):
+                self.input_resumed()
+                self.input_paused()
             self._answer_connect(who)
             self._resume_input()
         elif self._has_more:

@@ -309,6 +309,48 @@ async def test_what_answers_connack_is_new_however_long_the_login_took(harness, 
     await talking
 
 
+CONNECT, SUBSCRIBE, COMMAND = (
+    packet.encode(5)
+    for packet in (Connect("a"), Subscribe(1, [Subscription("y")]), Publish("x", b"1"))
+)
+
+
+@pytest.mark.parametrize("others_talk", [False, True])
+@pytest.mark.parametrize("websocket", [False, True])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (CONNECT + COMMAND,),
+        (CONNECT + SUBSCRIBE + COMMAND,),
+        (CONNECT + COMMAND[:3], COMMAND[3:]),
+        (CONNECT, COMMAND),
+    ],
+    ids=["one chunk", "behind another packet", "in two parts", "two chunks"],
+)
+async def test_what_came_with_connect_is_as_old_as_the_login(
+    harness, parts, websocket, others_talk
+):
+    """MQTT lets a client send on before it is answered."""
+    held = []
+
+    def published(_):
+        (wire,) = harness.scheduler.connections
+        held.append(wire.peer_status().held)
+
+    PublishObserver(harness, published)
+    harness.gate.clear()
+    peer = await (shake_hands(harness) if websocket else harness.dial())
+    for part in parts:
+        await peer.send(frame(part) if websocket else part)
+        await until(lambda: any(wire._logging_in for wire in harness.scheduler.connections))
+    await asyncio.sleep(0.4)
+    if others_talk:
+        harness.broker.accounting.now = asyncio.get_running_loop().time()
+    harness.gate.set()
+    await until(lambda: held, "the message")
+    assert held[0] >= 0.39
+
+
 async def test_what_comes_long_behind_a_slow_login_is_new(harness):
     """Nobody asks before."""
     harness.gate.clear()
