@@ -1,8 +1,8 @@
-"""Lets an entry of the appliance fail, once, when it is next passed: for `test_containment.py`.
+"""Fault injection for `test_containment.py`: an entry of the appliance raises when next passed.
 
-It fails before anything was done there, or when all was done: the state is another one then.
-What goes through `appliance.net.callbacks` and `Faults.run` is reached by the entry's name alone.
-Where an entry has a `try` of its own, INLINE says what is called in there, and by whom.
+It raises before its work or after it, because the state differs. Entries that go through
+`appliance.net.callbacks` and `Faults.run` are found by their names. For an entry with a `try` of
+its own, INLINE names what is called in there, and the caller.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ NAMED = {
 }
 ENTRY = re.compile(r"[a-z_]+(\.[a-z_]+)?")
 
-#: By entry: the module and class (or none) of what is called in its `try`, and the caller.
+#: By entry: module, class (or none) and name of what is called in its `try`, and the caller.
 INLINE = {
     "actions.look": ("ros.calls.action_topics", "ActionSubscriptions", "poll_graph", "poll_graph"),
     "app.certificates": ("app.main", "", "keep_server_certificate", ""),
@@ -90,7 +90,7 @@ INLINE = {
 
 
 def all_entries() -> set[str]:
-    """The names of all entries that stand in the sources."""
+    """The names of all entries in the sources."""
     found = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -119,17 +119,17 @@ def owner_of(module: str, kind: str, name: str) -> Any:
 
 
 class SabotageError(Exception):
-    """What nobody expected."""
+    """The injected fault."""
 
 
 class Saboteur:
-    """`arm` lets entries fail when they are next passed, each once."""
+    """After `arm`, each of these entries raises once when it is next passed."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        #: Those that are to fail before their work, and those behind it.
+        #: The entries that fail before their work, and those that fail after it.
         self._armed: set[str] = set()
         self._armed_behind: set[str] = set()
-        #: What was caught that nobody let fail, with where.
+        #: Caught errors that were not injected, with their entries.
         self.others: list[str] = []
         self._patch_entries(monkeypatch)
         places: dict[tuple[str, str, str], dict[str, str]] = {}
@@ -139,7 +139,7 @@ class Saboteur:
             self._patch_inline(monkeypatch, place, callers)
 
     def arm(self, *names: str, behind: str = "") -> None:
-        """Let these fail before their work, and this one when its work is done."""
+        """Let `names` fail before their work, and `behind` after its work."""
         self._armed = set(names)
         self._armed_behind = {behind} if behind else set()
 
@@ -183,7 +183,7 @@ class Saboteur:
         caught = Faults.caught
 
         def noted(own: Faults, entry: str, error: BaseException, served: object = "") -> None:
-            # What the loop tells of by itself is the clients' as well: they live in it, too.
+            # Errors that the loop reports may be those of the test's clients, which share it.
             theirs = entry == "loop" and isinstance(error, EOFError | OSError)
             if not isinstance(error, SabotageError) and not theirs:
                 self.others.append("".join(traceback.format_exception(error)) + f"at {entry}")

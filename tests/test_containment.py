@@ -1,10 +1,10 @@
-"""An exception out of every entry in turn, in an appliance under load: all others go on.
+"""Every entry raises an exception once, in an appliance under load: everything else continues.
 
-The entries are those that stand in the sources (`saboteur.all_entries`), so none is missing. While
-one after the other fails, clients of every kind do what they always do. Each of them must go on
-after each fault: a round trip, a message of 300 KB, a SUBSCRIBE with hundreds of filters, a will, a
-keep alive, `$SYS`; and at most a few connections may end by it. An entry fails twice, before its
-work and when it is done; then the sums are right, and nothing is left of who is gone.
+The entries are found in the sources (`saboteur.all_entries`), so that none is missing. While one
+after the other fails, clients of every kind continue their work: a round trip, a message of 300 KB,
+a SUBSCRIBE with hundreds of filters, a will, a keep alive, `$SYS`. Each must succeed after each
+fault, and a fault may end only a few connections. An entry fails twice, before its work and after
+it; afterwards the accounting is right, and nothing is left of clients that are gone.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules, OnSilence
 from appliance.store import committer, sqlite
 
-#: How often an entry is reached for, in PATIENCE: a fault may strike who reaches for it.
+#: Attempts to pass an entry within PATIENCE: a fault may hit the client that tries.
 ATTEMPTS = 3
 
-#: Seconds after which a client of the load gives up what it does, and begins anew.
+#: Timeout of a client's step in seconds; then it reconnects.
 STEP = 5.0
 
 LARGE = bytes(300_000)
@@ -84,7 +84,7 @@ class Listening(BasePlugin):
 
 
 class Actor:
-    """A client of the load: it does one thing, again and again; who cuts it off, it comes back."""
+    """A client of the load: it repeats one thing, and reconnects when it is disconnected."""
 
     clean = True
     keep_alive = 0
@@ -845,7 +845,7 @@ async def _busy(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.scheduler.is_busy()
 
 
-#: Those that no load of MQTT reaches, and the tests that let them fail.
+#: Entries that MQTT load does not pass, and the tests that let them fail.
 ELSEWHERE = {
     **dict.fromkeys(
         (
@@ -952,7 +952,7 @@ async def _all_right(site: Site, when: str) -> None:
 
 
 def _wrong(site: Site) -> str:
-    """What is left of who is gone, or is counted for nobody; empty when all is right."""
+    """State that is left of a client that is gone, or a wrong sum; empty when all is right."""
     broker, scheduler = site.broker, site.scheduler
     try:
         check_scheduler(scheduler)

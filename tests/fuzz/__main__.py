@@ -1,7 +1,7 @@
 """python tests/fuzz [--minutes 10] [--seed N] [--only codec|states|sessions|strangers] [--cases N]
 
-The minutes are shared among the four. What is found is printed, and saved as hex beside the seed;
-`--only KIND --seed SEED --cases 1` does the same again for the codec and the states.
+The minutes are shared among the four. Findings are printed, and saved as hex with the seed;
+`--only KIND --seed SEED --cases 1` repeats a case of the codec and the states.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""python tests/memory [SHAPE …]: by how much memory grows, and what the limits allow."""
+"""python tests/memory [SHAPE …]: prints the growth of memory, and what the limits allow."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What strangers and users can make the broker keep, in the shapes that take most for their bytes.
+"""State that clients can make the broker hold, in the shapes with most memory per byte sent.
 
-Each shape fills one kind of thing in a broker of its own until the limits say no.
-`python tests/memory` runs each in a process of its own and prints by how much its memory grew.
+Each shape fills one kind of state in a broker of its own until a limit refuses more.
+`python tests/memory` runs each in its own process and prints by how much memory grew.
 """
 
 from __future__ import annotations

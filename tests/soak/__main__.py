@@ -2,9 +2,9 @@
 
     .venv/bin/python tests/soak --minutes 10 --clients 200
 
-It ends with a table, and with the exit code 1 when the broker did anything wrong; then each wrong
-delivery is told with all that is known about the message and the session. The clients' choices
-follow from the seed that is printed, their timing does not.
+It prints a table. When the broker did anything wrong, the exit code is 1, and each wrong delivery
+is reported with all that is known about the message and the session. The printed seed determines
+the clients' choices, but not their timing.
 """
 
 from __future__ import annotations
