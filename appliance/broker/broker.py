@@ -599,36 +599,40 @@ class Broker:
         taken = full = False
         store_fails = refusable and self.accounting.failing
         message.publisher = origin
-        for session, qos, as_published, subscription_ids in targets:
-            if qos > published_qos:
-                qos = published_qos
-            try:
-                delivered = session.deliver(
-                    message, qos, retain and as_published, subscription_ids, None, refusable
-                )
-            except Exception as error:  # only this receiver misses the message
-                delivered = self._not_delivered(session, error)
-            if delivered:
-                taken = True
-            elif qos:
-                if store_fails and session.persistent:
-                    is_accepted = False  # the publisher has to retry, whether or not others got it
-                else:
-                    self._log_receiver_full(session, message)
-                full = True
-        for share, members in route.shares:
-            chosen = share.choose(members, message, None, refusable)
-            self.counters.cost += 1 + share.checked // CHECKS_PER_COST_UNIT
-            if chosen is not None and self._deliver_shared(chosen, message, share, refusable):
-                taken = True
-            elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
-                self.counters.publish_dropped += chosen is None
-                if store_fails and any(m[1] and m[0].persistent for m in members):
-                    is_accepted = False
-                else:
-                    self._log_receiver_full(asked, message)
-                full = True
-        message.publisher = None
+        try:
+            for session, qos, as_published, subscription_ids in targets:
+                if qos > published_qos:
+                    qos = published_qos
+                try:
+                    delivered = session.deliver(
+                        message, qos, retain and as_published, subscription_ids, None, refusable
+                    )
+                except Exception as error:  # only this receiver misses the message
+                    delivered = self._not_delivered(session, error)
+                if delivered:
+                    taken = True
+                elif qos:
+                    if store_fails and session.persistent:
+                        is_accepted = (
+                            False  # the publisher has to retry, whether or not others got it
+                        )
+                    else:
+                        self._log_receiver_full(session, message)
+                    full = True
+            for share, members in route.shares:
+                chosen = share.choose(members, message, None, refusable)
+                self.counters.cost += 1 + share.checked // CHECKS_PER_COST_UNIT
+                if chosen is not None and self._deliver_shared(chosen, message, share, refusable):
+                    taken = True
+                elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
+                    self.counters.publish_dropped += chosen is None
+                    if store_fails and any(m[1] and m[0].persistent for m in members):
+                        is_accepted = False
+                    else:
+                        self._log_receiver_full(asked, message)
+                    full = True
+        finally:
+            message.publisher = None
         if not is_accepted or (full and not taken):
             return ReasonCode.QUOTA_EXCEEDED
         # A receiver without room misses the message, which is logged but not reported: the

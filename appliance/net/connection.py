@@ -24,8 +24,7 @@ from appliance.broker.ports import LOCAL_PEER, Exchange, Identity, PeerStatus, R
 from appliance.mqtt.connection import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.net import lingering as lingering
-from appliance.net import tls
+from appliance.net import lingering, tls
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.scheduler import PUBLISH_BURST, Scheduler
 from appliance.net.sockets import Probe, peer_status, receive_buffer

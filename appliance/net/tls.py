@@ -216,8 +216,8 @@ class TlsTransport:
         try:
             # Not larger than needed: Python allocates a buffer of this size beforehand.
             size = RECORD_SIZE if self._cut else self._incoming.pending
-            while linger := self._tls.read(size):
-                parts.append(linger)
+            while part := self._tls.read(size):
+                parts.append(part)
                 if not self._incoming.pending:  # another read would only raise
                     self._cut = False
                     return
@@ -483,8 +483,8 @@ def name_in(certificate: Mapping[str, Any] | None) -> str:
     """The common name of a certificate's subject, or else its first alternative name."""
     if not certificate:
         return ""
-    for linger in certificate.get("subject", ()):
-        for key, value in linger:
+    for part in certificate.get("subject", ()):
+        for key, value in part:
             if key == "commonName":
                 return str(value)
     return next((str(value) for _, value in certificate.get("subjectAltName", ())), "")
