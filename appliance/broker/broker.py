@@ -570,7 +570,9 @@ class Broker:
             ProtocolError: the topic is not valid.
         """
         route = self.router.route(origin, message.topic_wire)
-        return self.publish_to(route.targets, route, message, origin, refusable=False)
+        code = self.publish_to(route.targets, route, message, origin, refusable=False)
+        message.rejection = None  # nobody is answered
+        return code
 
     def publish_to(
         self,

@@ -332,7 +332,8 @@ class ClientHandler:
         code = self.broker.publish_to(targets, route, message, session)
         if qos:
             if message.rejection is not None:
-                self.output.reject_publish(0x40, packet_id, message.rejection)
+                rejection, message.rejection = message.rejection, None
+                self.output.reject_publish(0x40, packet_id, rejection)
                 return
             reason = self._reason(code, route, message) if code >= 0x80 else ""
             self.output.acknowledge(0x40, packet_id, code, reason)
@@ -376,7 +377,8 @@ class ClientHandler:
         else:
             code = broker.publish_to(route.targets, route, message, session)
             if packet.qos and message.rejection is not None:
-                self.output.reject_publish(0x40, packet_id, message.rejection)
+                rejection, message.rejection = message.rejection, None
+                self.output.reject_publish(0x40, packet_id, rejection)
             elif packet.qos:
                 reason = self._reason(code, route, message) if code >= 0x80 else ""
                 self.output.acknowledge(0x40, packet_id, code, reason)

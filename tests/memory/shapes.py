@@ -93,8 +93,8 @@ class Filling:
             packet = Publish(topic(number), payload, 1, retain, False, 1, properties)
             peer.client.receive(packet.encode(5))
             self.broker.flush()
-            answer = bytes(peer.wire.written)
-            peer.wire.written.clear()
+            answer = bytes(peer.transport.written)
+            peer.transport.written.clear()
             if answer[-1] == 0x97:
                 break
 
@@ -193,10 +193,10 @@ def messages_under_way(filling: Filling) -> None:
         packet = Publish(topic, b"", 1, packet_id=1).encode(5)
         publisher.client.receive(packet)
         filling.broker.flush()
-        answer = bytes(publisher.wire.written)
-        publisher.wire.written.clear()
+        answer = bytes(publisher.transport.written)
+        publisher.transport.written.clear()
         for peer in peers:
-            peer.wire.written.clear()
+            peer.transport.written.clear()
         if answer[-1] == 0x97:
             break
 
@@ -228,7 +228,7 @@ def qos_2_that_is_never_released(filling: Filling) -> None:
         peer = filling.join(f"holder{number}", 4)
         for packet_id in range(1, 2000):
             peer.client.receive(Publish("a", b"", 2, packet_id=packet_id).encode(4))
-            if peer.wire.closed:
+            if peer.transport.closed:
                 break
         filling.broker.flush()
 
@@ -358,7 +358,7 @@ def unfinished_packets(filling: Filling) -> None:
         filling.peers.append(peer)
         for start in range(0, 1_000_000, 2):
             peer.client.receive(packet[start : start + 2])
-            if peer.wire.closed:
+            if peer.transport.closed:
                 return
 
 
@@ -373,8 +373,8 @@ def topic_aliases(filling: Filling) -> None:
         for alias in range(1, 11):
             topic = f"{number}/{alias}{WIDE}" + "x" * 10_000
             peer.send(Publish(topic, b"", properties={Property.TOPIC_ALIAS: alias}))
-            peer.wire.written.clear()
-            if peer.wire.closed:
+            peer.transport.written.clear()
+            if peer.transport.closed:
                 break
 
 
@@ -390,7 +390,7 @@ def routes(filling: Filling) -> None:
             topic = f"{number}/{index}{WIDE}" + "x" * 450
             peer.client.receive(Publish(topic, b"", retain=False).encode(5))
         filling.broker.flush()
-        everybody.wire.written.clear()
+        everybody.transport.written.clear()
 
 
 @shape(subscriptions=100_000)
@@ -409,4 +409,4 @@ def routes_with_identifiers(filling: Filling) -> None:
             peer.client.receive(Publish(topic, b"").encode(5))
             if not index % 20:
                 filling.broker.flush()
-                everybody.wire.written.clear()
+                everybody.transport.written.clear()

@@ -489,8 +489,10 @@ class ProvidedService:
 
 
 def _is_error(payload: bytes, encoding: EncodingName) -> bool:
+    # What cannot be read as ROS's own bytes may be an error all the same, which is JSON then.
+    values = VALUE_ENCODINGS.get(encoding) or VALUE_ENCODINGS["json"]
     try:
-        value = VALUE_ENCODINGS[encoding].loads(payload)
+        value = values.loads(payload)
     except ConversionError:
         return False
     return isinstance(value, dict) and isinstance(value.get("error"), dict)

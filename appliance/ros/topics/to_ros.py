@@ -213,7 +213,9 @@ class ToRos(Flow):
     ) -> PublishRejection:
         """The rejection that is sent to the client; for QoS 1 its PUBACK carries it."""
         rejection = PublishRejection(code, f"a message for {self.ros} {problem}"[:REASON_LENGTH])
-        if message.qos == 1:
+        # Only while its publisher waits for an answer: a message that is retained or queued would
+        # keep the reason, uncounted.
+        if message.qos == 1 and message.publisher is not None:
             message.rejection = rejection
         return rejection
 

@@ -516,6 +516,25 @@ async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(harness):
     }
 
 
+@pytest.mark.parametrize(
+    "payload",
+    [b"\0\1\0\0\1", b'{"error": {"code": "busy", "message": "no"}}'],
+    ids=["cut", "error"],
+)
+async def test_an_answer_that_is_no_cdr_is_an_error(harness, payload):
+    """It says that it is, and is too short, or an error as JSON."""
+    on_error = '{"success": false, "message": "nobody"}'
+    harness.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=20, on_error=on_error))
+    client = harness.client("alice", "r2d2/ask/_request/+")
+    answers = []
+    harness.node.ask("/ask", cdr(f"{SET_BOOL}_Request", {}), answers.append)
+    await until(lambda: client.received, "the request")
+    token = client.received[-1].topic.rpartition("/")[2]
+    client.send(f"r2d2/ask/_response/{token}", payload, content_type="application/cdr")
+    await until(lambda: answers, "the answer")
+    assert value(f"{SET_BOOL}_Response", answers[0])["message"] == "nobody"
+
+
 async def test_without_on_error_ros_gets_nothing(harness):
     harness.start(PROVIDED)
     asker = Asker(harness)

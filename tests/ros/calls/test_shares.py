@@ -339,7 +339,8 @@ async def test_a_message_that_exceeds_the_conversion_queue_is_rejected(harness, 
     alice = harness.client("alice")
     for _ in range(6):
         message = Message("r2d2/a", json.dumps({"data": "a" * 5000}).encode(), 1)
-        harness.broker.publish(message, alice.session)
+        route = harness.broker.router.route(alice.session, message.topic_wire)
+        harness.broker.publish_to(route.targets, route, message, alice.session)
     rejection = message.rejection
     assert rejection.code == 0x97 and "waits to be converted" in rejection.reason
     await until(lambda: len(peer.received) == 4, "those that had room")
