@@ -208,8 +208,9 @@ def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Itera
             "files that this command makes (server.crt, server.key, ca.crt in one directory)"
         )
     made = not authority.exists()
-    if made and directory.is_dir():
-        # Git creates folders as open as the umask allows; nobody else may put a CA in its place.
+    if made and directory.is_dir() and {file.name for file in directory.iterdir()} == {readme.name}:
+        # As a clone of the repository has it: git creates folders as open as the umask allows, and
+        # nobody else may put a CA in its place. A folder with more in it is somebody's own.
         with contextlib.suppress(PermissionError):  # another user's folder
             directory.chmod(directory.stat().st_mode & ~0o022)
     names, addresses = certs.local_names()
@@ -258,9 +259,8 @@ def _write_new(path: Path, text: str, mode: int = 0o644) -> bool:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
-        os.link(
-            draft, path
-        )  # unlike a rename, this never replaces a file that was created meanwhile
+        # Unlike a rename, this never replaces a file that was created meanwhile.
+        os.link(draft, path)
     except FileExistsError:
         return False
     finally:

@@ -273,3 +273,18 @@ def test_ros_stays_on_this_computer_unless_the_file_says_otherwise(
 ) -> None:
     list(initialise(tmp_path, demo=demo))
     assert config.load(tmp_path / "appliance.yaml").bridge.discovery == "localhost"
+
+
+def test_a_folder_of_somebodys_own_keeps_its_mode(tmp_path: Path) -> None:
+    """Certificates may be beside appliance.yaml, in a folder that a group shares."""
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    (shared / "notes.txt").touch()
+    (shared / "appliance.yaml").write_text(
+        "robot: r2d2\nbridge: {bus: none}\n"
+        "broker: {tls: {certificate: server.crt, key: server.key, ca: ca.crt}}\n"
+    )
+    shared.chmod(0o2775)
+    list(initialise(shared))
+    assert (shared / "ca.crt").exists()
+    assert mode(shared) == 0o2775
