@@ -30,11 +30,11 @@ FLOAT = compile_converter(
 )
 
 
-class Hex(Encoding):
+class Digits(Encoding):
     """ROS's own bytes as hexadecimal digits: all that a new encoding needs."""
 
-    name = "hex"
-    content_type = "text/x-hex"
+    name = "digits"
+    content_type = "text/x-digits"
     is_text = True
 
     def encoder(self, converter: Converter) -> Encode:
@@ -78,15 +78,15 @@ def test_content_types_are_distinct_and_name_their_encoding() -> None:
 
 
 def test_an_encoding_that_is_registered_carries_topics(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ENCODINGS, "hex", Hex())
+    monkeypatch.setitem(ENCODINGS, "digits", Digits())
     cdr = FLOAT.from_dict({"data": 0.5})
-    payload, properties = packer(FLOAT, "hex", "none", [])(cdr)
+    payload, properties = packer(FLOAT, "digits", "none", [])(cdr)
     assert payload == cdr.hex().encode()
-    assert properties[Property.CONTENT_TYPE] == "text/x-hex"
+    assert properties[Property.CONTENT_TYPE] == "text/x-digits"
     for compression in ("none", "zstd"):
-        payload, _ = packer(FLOAT, "hex", compression, [])(cdr)
-        assert unpacker(FLOAT, "hex", compression, InputLimits())(payload) == cdr
-    read = unpacker(FLOAT, "hex", "none", InputLimits(payload=40))
+        payload, _ = packer(FLOAT, "digits", compression, [])(cdr)
+        assert unpacker(FLOAT, "digits", compression, InputLimits())(payload) == cdr
+    read = unpacker(FLOAT, "digits", "none", InputLimits(payload=40))
     for wrong, problem in ((b"0g", "not hexa"), (b"00010000", "truncated"), (b"0" * 41, "at most")):
         with pytest.raises(ConversionError, match=problem):
             read(wrong)
