@@ -28,11 +28,12 @@ class ServiceRequest:
     """A request on its way from the loop's thread to a service.
 
     The loop's thread sets `is_abandoned` when nobody waits for the answer any more, and alone
-    settles `answer`; all else is the ROS thread's from the moment it has the request.
+    settles `answer`; all else is the ROS thread's from the moment it has the request. `cdr` is
+    None once it was sent.
     """
 
     key: Key
-    cdr: bytes
+    cdr: bytes | None
     answer: asyncio.Future[bytes]
     is_abandoned: bool = False
     give_up: Callable[[], None] | None = None
@@ -110,9 +111,8 @@ class ServiceClients:
             client.sent.clear()
         client.was_ready = is_ready
         if is_ready:
-            for request in client.waiting:
-                self._send(client, request)
-            client.waiting.clear()
+            while client.waiting:  # one whose sending raises is not sent again by the next poll
+                self._send(client, client.waiting.pop(0))
         elif client.waiting and not self._is_available(key):
             for request in client.waiting:
                 self._fail(request, *self._unavailable(key))
@@ -173,8 +173,8 @@ class ServiceClients:
             self._fail(request, *self._unavailable(key))
 
     def _send(self, client: _ServiceClient, request: ServiceRequest) -> None:
-        cdr, request.cdr = request.cdr, b""  # it may be large, and is needed no more
-        if request.is_abandoned:
+        cdr, request.cdr = request.cdr, None  # it may be large, and is needed no more
+        if cdr is None or request.is_abandoned:
             return
 
         def done(response: bytes | BusError) -> None:

@@ -21,7 +21,7 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.ros.bridge import Bridge
 from appliance.ros.calls import dispatcher as calls
 from appliance.ros.calls.dispatcher import CallLimits
-from appliance.ros.node import FakeNode
+from appliance.ros.node import FakeClient, FakeNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
 from appliance.ros.payload.payloads import InputLimits
@@ -420,6 +420,37 @@ async def test_calls_under_way_are_answered_when_the_appliance_stops_or_ros_ends
     await until(lambda: len(switch.asked) == 2, "the request")
     await harness.bridge.stop()
     assert (await calling)[0] == "stopping"
+
+
+async def test_requests_that_waited_are_sent_once_when_sending_one_raises(
+    harness, monkeypatch, escaped
+):
+    harness.start(service("/switch"))
+    Switch(harness)
+    client = harness.client("alice")
+    sent = []
+
+    def call(_, request, done):
+        sent.append(request)
+        if len(sent) == 2:
+            raise OSError("too many open files")
+        return lambda: None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeClient, "is_ready", lambda _: False)
+        patch.setattr(FakeClient, "call", call)
+        await asyncio.sleep(0)
+        for number in range(3):
+            client.send(CALL, {"data": True}, response_topic=f"answers/{number}")
+        await asyncio.sleep(0.01)
+        assert sent == []
+        patch.setattr(FakeClient, "is_ready", lambda _: True)
+        for _ in range(4):
+            harness.node.spin()
+    assert sent == [cdr(f"{SET_BOOL}_Request", {"data": True})] * 3
+    await asyncio.sleep(0)
+    assert len(escaped) == 1
+    escaped.clear()
 
 
 async def test_the_calls_of_a_client_that_has_gone_are_removed(harness):
