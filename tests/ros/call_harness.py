@@ -20,6 +20,7 @@ from appliance.ros.calls.routes import (
     ParameterSettings,
     ServiceSettings,
 )
+from appliance.ros.node import BusError
 from appliance.ros.payload.definitions import import_message
 from appliance.store import MemoryStore
 
@@ -158,6 +159,21 @@ class CallHarness:
 
     def counters(self, index=0):
         return self.bridge.calls.status()[index].counters
+
+    def replace_while_the_node_joins(self, monkeypatch, *routes):
+        """Replace the routes when there is no node yet; it joins and polls before that is done."""
+        node = self.node
+        node.running = False
+
+        def call_soon(callback):
+            monkeypatch.undo()
+            node.running = True
+            node.spin()
+            raise BusError("ROS is not ready")
+
+        monkeypatch.setattr(node, "call_soon", call_soon)
+        self.bridge.calls.replace(call_routes(*routes))
+        assert node.running
 
     def retained(self, topic):
         message = self.broker.retained.get(topic)

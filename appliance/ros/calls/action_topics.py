@@ -45,6 +45,9 @@ class ActionSnapshot:
     status_clears: int = 0
     #: Goals to cancel should their server accept them yet.
     abandoned: frozenset[bytes] = frozenset()
+    #: Whether the route was removed, which is final. A node that joins meanwhile polls before the
+    #: action is removed from the polled ones, and must not subscribe.
+    is_removed: bool = False
 
 
 class ActionListener(Protocol):
@@ -88,7 +91,6 @@ class ActionSubscriptions:
         self._subscriptions: list[RosSubscription] = []
         self._subscribed_type: str | None = None
         self._handled_clears = 0
-        self._is_closed = False
         self._servers = 0
         self._last_problem = ""
         counters = FlowCounters()
@@ -104,7 +106,7 @@ class ActionSubscriptions:
         """Report new servers, and subscribe once the type is known."""
         snapshot = self._snapshot  # read once: the loop's thread may replace it meanwhile
         type_name = snapshot.type
-        if self._is_closed or type_name is None:
+        if snapshot.is_removed or type_name is None:
             return
         servers = self._node.count(f"{self.ros}/_action/status")[0]
         if servers > self._servers and self._subscribed_type is not None:
@@ -141,8 +143,7 @@ class ActionSubscriptions:
         self._subscriptions.clear()
 
     def close(self) -> None:
-        """End the subscriptions for good, and clear the retained status."""
-        self._is_closed = True
+        """End the subscriptions of a removed action, and clear the retained status."""
         self._unsubscribe()
         self._clear_status()
 

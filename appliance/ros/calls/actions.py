@@ -404,6 +404,8 @@ class BridgedAction:
         #: Topics of retained results, and until when; they all have the same time.
         self._results: FairCache[str, float] = FairCache(MAX_RESULTS, MAX_RESULT_BYTES)
         self._status_clears = 0
+        #: Set by `stop`, and never unset.
+        self._is_removed = False
         self._is_logged = False
         #: The ROS thread's side.
         self.subscriptions = ActionSubscriptions(
@@ -444,7 +446,11 @@ class BridgedAction:
     def _update_subscriptions(self) -> None:
         self.subscriptions.update(
             ActionSnapshot(
-                self.type, self.is_available, self._status_clears, frozenset(self._abandoned)
+                self.type,
+                self.is_available,
+                self._status_clears,
+                frozenset(self._abandoned),
+                self._is_removed,
             )
         )
 
@@ -707,6 +713,8 @@ class BridgedAction:
         for endpoint in self._endpoints:
             self._dispatcher.unregister(endpoint)
         self.clear_status()
+        self._is_removed = True
+        self._update_subscriptions()
         with contextlib.suppress(BusError):  # without a bus there are no subscriptions either
             self._node.call_soon(self.subscriptions.close)
 

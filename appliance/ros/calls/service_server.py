@@ -29,7 +29,7 @@ class RequestHandler(Protocol):
 
 
 class ServiceServer:
-    """A service of this node; for the ROS thread."""
+    """A service of this node. `retire` is for the loop's thread, all else for the ROS thread."""
 
     def __init__(
         self,
@@ -51,11 +51,19 @@ class ServiceServer:
         self._post = post
         self._service: RosService | None = None
         self._is_tried = False
-        self._is_closed = False
+        #: Set by the loop's thread, and never unset.
+        self._is_retired = False
+
+    def retire(self) -> None:
+        """Never create the service from now on; `close` destroys it where it exists.
+
+        A node that joins meanwhile polls before this is removed from the polled ones.
+        """
+        self._is_retired = True
 
     def poll_graph(self) -> None:
         """Create the service as soon as there is a bus."""
-        if self._is_tried or self._is_closed:
+        if self._is_retired or self._is_tried:
             return
         self._is_tried = True
         try:
@@ -74,8 +82,7 @@ class ServiceServer:
         self._post(self._handler.requested, payload, respond)
 
     def close(self) -> None:
-        """Destroy the service for good."""
-        self._is_closed = True
+        """Destroy the service, which was retired before."""
         if self._service is not None:
             self._service.destroy()
             self._service = None

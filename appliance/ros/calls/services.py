@@ -484,6 +484,7 @@ class ProvidedService:
         self._dispatcher.unsubscribe(f"{self._base}/_response/+")
         for token in list(self._pending):
             self._give_up(token, "stopping: the service is offered no longer")
+        self.server.retire()
         with contextlib.suppress(BusError):  # without a bus there is no service either
             self._node.call_soon(self.server.close)
 

@@ -266,6 +266,17 @@ async def test_a_goal_that_outlives_its_route_ends_with_its_client_all_the_same(
     assert [id_of({"uuid": uuid}).hex() for uuid in walks.cancelled] == [goal]
 
 
+async def test_a_removed_action_is_not_subscribed_to_by_a_node_that_joins_meanwhile(
+    harness, monkeypatch
+):
+    await begin(harness)
+    assert harness.node.subscriptions
+    harness.node.fail("the node ended")
+    harness.replace_while_the_node_joins(monkeypatch)
+    harness.node.spin()
+    assert harness.node.subscriptions == []
+
+
 async def test_the_appliance_stops_with_a_goal_whose_route_is_gone(harness):
     walks, client = await begin(harness, cancel_on_disconnect=True)
     await client.call(GOAL, {"order": 3})

@@ -585,6 +585,16 @@ async def test_an_offered_service_goes_with_its_route(harness):
     assert [s.name for s in harness.node.own_services] == ["/ask"]
 
 
+async def test_a_removed_service_is_not_offered_by_a_node_that_joins_meanwhile(
+    harness, monkeypatch
+):
+    harness.start(PROVIDED)
+    harness.node.fail("the node ended")
+    harness.replace_while_the_node_joins(monkeypatch)
+    harness.node.spin()
+    assert harness.node.own_services == []
+
+
 async def test_bridges_without_calls_ask_nothing_of_the_graph(harness):
     harness.node.services = None  # would raise
     bridge = harness.start()
