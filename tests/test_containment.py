@@ -51,8 +51,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 from appliance.net import connection as wire
-from appliance.net import lingering as lingering
-from appliance.net import listeners, tls
+from appliance.net import lingering, listeners, tls
 from appliance.ops.control import ControlError, ask
 from appliance.ops.crash import CrashReports
 from appliance.ops.sd_notify import Notifier

@@ -45,8 +45,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 from appliance.net import connection as wire
-from appliance.net import lingering as lingering
-from appliance.net import listeners, scheduler, sockets
+from appliance.net import lingering, listeners, scheduler, sockets
 from appliance.net.listeners import Admission, ListenerSettings
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
