@@ -754,6 +754,8 @@ async def _loop(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("bridge.post", "bridge.message", "bridge.drain")
 async def _ros_message(site: Site, patch: pytest.MonkeyPatch) -> None:
+    # Only a message that comes into an empty mailbox wakes the loop.
+    await until(lambda: not site.bridge._mailbox._is_awake, "an empty mailbox")
     site.node.spin()
     for _ in range(200):
         site.up.publish(b"\0\1\0\0\2\0\0\0x\0\0\0")
@@ -889,7 +891,10 @@ async def _in_turn(directory: Path, saboteur: Saboteur) -> None:
             except (AssertionError, asyncio.TimeoutError, OSError, EOFError, Exception) as error:
                 problems.append(f"{name}: {type(error).__name__}: {error}")
                 print(problems[-1], flush=True)
+        # The load's clients may all have disconnected while the bridge stops.
+        peer = await site.log_in("connected-to-the-end")
         saboteur.arm("stop.session")
+    peer.hang_up()
     assert site.faults.by_entry.get("stop.session") == 1
     assert not problems, "\n".join(problems)
 
