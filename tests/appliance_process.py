@@ -227,7 +227,7 @@ class MosquittoProcess(BrokerProcess):
     def start(self) -> None:
         """Start it on ports that were free a moment ago."""
         assert MOSQUITTO is not None
-        self.port, self.plain_port = _free_ports(2)
+        self.port, self.plain_port = free_ports(2)
         root = "user root\n" if os.geteuid() == 0 else ""  # else it cannot read the key
         (self.directory / "mosquitto.conf").write_text(
             f"{root}allow_anonymous false\npassword_file {self.directory}/users.passwd\n"
@@ -244,7 +244,7 @@ class MosquittoProcess(BrokerProcess):
             raise
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
     ports = [sock.getsockname()[1] for sock in sockets]
     for sock in sockets:

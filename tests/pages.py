@@ -46,13 +46,16 @@ class Page:
         return [link for link in _LINK.findall(self.prose) if "://" not in link]
 
     def commands(self) -> Iterator[str]:
-        """Lines that are typed into a shell; one that goes on in the next line is one."""
-        for block in self.blocks("sh"):
-            yield from block.replace("\\\n", " ").splitlines()
-        for block in self.blocks("console"):
-            for line in block.splitlines():
-                if line.startswith("$ "):
-                    yield line[2:]
+        """Lines that are typed into a shell, in the page's order.
+
+        One that goes on in the next line is one.
+        """
+        for language, block in _FENCE.findall(self.text):
+            lines = block.replace("\\\n", " ").splitlines()
+            if language == "sh":
+                yield from lines
+            elif language == "console":
+                yield from (line[2:] for line in lines if line.startswith("$ "))
 
     def quoted(self) -> list[str]:
         """What stands between backticks in the prose."""

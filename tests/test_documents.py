@@ -1,26 +1,21 @@
-"""README, CONTRIBUTING and docs/: their commands, options, configurations and links are true."""
+"""README, CONTRIBUTING and docs/: their options, configurations and links are true.
+
+test_page_commands.py runs their commands.
+"""
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
-from appliance_process import ApplianceProcess
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import Encoding
-from cryptography.x509.oid import NameOID
 from pages import PROJECT, Page, anchor, pages
-from waiting import PATIENCE
 
 from appliance import config
 from appliance.cli import main as cli
@@ -31,12 +26,6 @@ NAMES = [page.name for page in PAGES]
 
 #: Lines that README may have: more belongs into docs/.
 LONGEST_README = 200
-
-#: Commands that are run as they stand: where no appliance has run, beside one, and after one. All
-#: others, which need a bus of ROS, root or minutes, are run elsewhere, and here only parsed.
-OFFLINE = ("init", "check", "user", "acl", "cert", "fastdds")
-ONLINE = ("status", "reload")
-AFTERWARDS = ("store",)
 
 
 def invocations(page: Page) -> Iterator[list[str]]:
@@ -178,68 +167,6 @@ def test_commands_in_the_text_are_ones_that_there_are(page: Page) -> None:
         if is_unknown or {*options} - options_of(command):
             unknown.append(text)
     assert unknown == []
-
-
-@pytest.fixture
-def typed(tmp_path: Path) -> Callable[[list[str]], None]:
-    """Runs a command line, beside an appliance.yaml, and fails when it does."""
-
-    def run(words: list[str]) -> None:
-        home = tmp_path / "home"
-        words = [word.replace("~", str(home), 1) if word[0] == "~" else word for word in words]
-        done = subprocess.run(
-            [sys.executable, "-m", "appliance", *words],
-            cwd=home / "appliance",
-            env={**os.environ, "HOME": str(home), "NO_COLOR": "1"},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=PATIENCE,
-        )
-        assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}"
-
-    (tmp_path / "home/appliance").mkdir(parents=True)
-    return run
-
-
-@pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_what_needs_no_running_appliance_does_what_it_says(
-    page: Page, typed: Callable[[list[str]], None], tmp_path: Path
-) -> None:
-    lines = [words for words in invocations(page) if words and words[0] in OFFLINE]
-    if not lines:
-        return
-    typed(["init", "--robot", "r2d2"])
-    (tmp_path / "home/appliance/device.csr").write_bytes(signing_request())
-    for words in lines:
-        asks = words[:2] in (["user", "add"], ["user", "passwd"])
-        typed([*words, "--generate"] if asks and "--generate" not in words else words)
-
-
-def test_what_asks_a_running_appliance_is_answered(
-    typed: Callable[[list[str]], None], tmp_path: Path
-) -> None:
-    lines = [words for page in PAGES for words in invocations(page) if words]
-    assert {words[0] for words in lines} >= {*ONLINE, *AFTERWARDS}
-    appliance = ApplianceProcess(tmp_path / "home/appliance")
-    appliance.start()
-    try:
-        for words in lines:
-            if words[0] in ONLINE:
-                typed(words)
-    finally:
-        appliance.stop()
-    for words in lines:
-        if words[0] in AFTERWARDS:
-            typed(words)
-
-
-def signing_request() -> bytes:
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "device")])
-    request = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA256())
-    return request.public_bytes(Encoding.PEM)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)

@@ -33,7 +33,7 @@ import yaml
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
 
-from appliance_process import HOST, MOSQUITTO, ROBOT, ApplianceProcess, _free_ports  # noqa: E402
+from appliance_process import HOST, MOSQUITTO, ROBOT, ApplianceProcess, free_ports  # noqa: E402
 from waiting import PATIENCE, until  # noqa: E402
 
 from appliance.host.environment import for_other_programs  # noqa: E402
@@ -94,7 +94,7 @@ class Network:
         self.flowing.set()
         self.tasks = set()
         self.server = None
-        (self.port,) = _free_ports(1)
+        (self.port,) = free_ports(1)
 
     async def mend(self):
         self.server = await asyncio.start_server(self._serve, HOST, self.port, family=2)
@@ -143,7 +143,7 @@ class Robot:
         self.appliance = ApplianceProcess(directory, acl=f"user alice\ntopic {ROBOT}/#\n")
         config = self.appliance.config
         settings = yaml.safe_load(config.read_text())
-        self.ports = _free_ports(2)
+        self.ports = free_ports(2)
         settings["broker"]["listeners"] = [
             {"bind": f"127.0.0.1:{self.ports[0]}", "tls": True},
             {"bind": f"127.0.0.1:{self.ports[1]}"},
@@ -248,7 +248,7 @@ class Client:
     def _start_broker(self, user, password):
         directory = self.robot.directory / f"mosquitto-{self.index}"
         directory.mkdir()
-        (port,) = _free_ports(1)
+        (port,) = free_ports(1)
         version = {"3.1.1": "mqttv311", "5": "mqttv50"}[self.version]
         config = directory / "mosquitto.conf"
         config.write_text(

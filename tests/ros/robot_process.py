@@ -15,13 +15,13 @@ from appliance.host.environment import for_other_programs
 
 
 class Robot:
-    """robot.py in a process of its own."""
+    """robot.py, or another program beside it, in a process of its own."""
 
-    def __init__(self):
+    def __init__(self, program="robot.py"):
         self.told = queue.Queue()
         self._answers = queue.Queue()
         self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).parent / "robot.py")],
+            [sys.executable, str(Path(__file__).parent / program)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
