@@ -1,0 +1,1 @@
+"""The link to a fleet's broker: the appliance as an MQTT client, with topics carried both ways."""
