@@ -862,6 +862,7 @@ ELSEWHERE = {
         "ros/ros2/test_ros2_contained.py",
     ),
     "stop.session": "test_containment.py",
+    "store.read": "store/test_memory_backlogs.py",
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Callable
 
 from appliance.broker.accounts import Account
@@ -9,6 +11,9 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.mqtt.packets import Subscription
+from appliance.net.callbacks import Entries
+from appliance.store.clock import StoreClock, boot_id
+from appliance.store.memory_backlogs import MemoryBacklogs
 from appliance.store.state import StoreState
 
 
@@ -17,6 +22,7 @@ class MemoryStore(StoreState):
 
     path = None
     failing = False
+    backlogs: MemoryBacklogs
 
     def __init__(self) -> None:
         super().__init__(size=1 << 62)  # only the broker's own limits apply
@@ -26,6 +32,13 @@ class MemoryStore(StoreState):
 
     def restore(self, broker: Broker) -> None:
         """See `SessionStore`; nothing was stored."""
+        loop = asyncio.get_running_loop()
+        clock = StoreClock(time.time, boot_id)
+        clock.start(loop.time, None)
+        entries = Entries(loop, broker.faults)
+        self.backlogs = MemoryBacklogs(
+            lambda callback: entries.soon("store.read", callback), clock.now
+        )
 
     async def close(self) -> None:
         """See `SessionStore`; there is nothing to release."""
