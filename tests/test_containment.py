@@ -662,6 +662,11 @@ async def _guarded(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.broker.guards_changed()
 
 
+@reach("broker.rules")
+async def _rules_change(site: Site, patch: pytest.MonkeyPatch) -> None:
+    site.broker.rules_changed()  # which sessions inside the appliance are told
+
+
 @reach("session.replay")
 async def _retained(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.app._publish("r/x", b"x", True)

@@ -199,7 +199,10 @@ class Reload:
         """Disconnect removed users; returns what has changed. Rights: `rules_changed`."""
         removed = set(changes.users_removed)  # plugins may know users that the file has not
         for session in list(self._parts.broker.sessions.values()):
-            if session.identity and session.identity.username in removed:
+            # A session inside the appliance has not logged in: the rules alone decide about it.
+            if session.is_inside or session.identity is None:
+                continue
+            if session.identity.username in removed:
                 session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
         words = {
             "users_added": "new users: ",

@@ -135,7 +135,7 @@ class Status:
 
     def _clients(self) -> dict[str, Any]:
         broker = self._parts.broker
-        known = [session for session in broker.sessions.values() if session.identity is not None]
+        known = [session for session in broker.sessions.values() if not session.is_inside]
         return {
             "clients": len(broker.clients),
             "sessions": len(known),

@@ -21,11 +21,13 @@ from appliance.broker.backpressure import Congestion
 from appliance.broker.faults import Faults
 from appliance.broker.message import DelayedMessage, HeaderCache, Message
 from appliance.broker.ports import (
+    INSIDE,
     Access,
     Action,
     AuditLog,
     Features,
     Identity,
+    InsideLink,
     Limits,
     Link,
     Observer,
@@ -194,9 +196,9 @@ class Broker:
         """Create or resume an authenticated client's session; returns it and whether it existed.
 
         Raises:
-            ProtocolError: 0x85, the client id belongs to a session of another user, which is left
-                alone; 0x97, the user has reached its limit of connections or sessions, or there is
-                no memory for the will.
+            ProtocolError: 0x85, the client id belongs to a session of another user, or to one
+                inside the appliance, which is left alone; 0x97, the user has reached its limit of
+                connections or sessions, or there is no memory for the will.
         """
         self.counters.cost += CONNECT_COST
         account = self.accounting.accounts.of(identity)
@@ -206,6 +208,11 @@ class Broker:
         session = self.sessions.get(identity.client_id)
         if session is not None:
             owner = session.identity
+            if session.is_inside:
+                raise ProtocolError(
+                    ReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
+                    f"client id {quote(identity.client_id)} is the appliance's own",
+                )
             if owner is None or owner.username != identity.username:
                 raise ProtocolError(
                     ReasonCode.CLIENT_IDENTIFIER_NOT_VALID,
@@ -354,16 +361,29 @@ class Broker:
         session.unchecked = True
         session.resend()
 
-    def attach(self, client_id: str, link: Link) -> Session:
-        """A session inside the appliance, with all rights, which exists until `detach`."""
+    def attach(self, client_id: str, link: Link, identity: Identity | None = None) -> Session:
+        """A session inside the appliance, which exists until `detach`.
+
+        Without an identity it has all rights. With one, it has those of that user, and the messages
+        that it retains are the user's. In neither case it counts against limits of the user, is
+        evicted, or is stored; an `InsideLink` is told when the access rules change.
+
+        Raises:
+            ValueError: there is a session with this id inside already, or a client could take the
+                id of the identity, which must be `client_id`.
+        """
+        if identity is not None and (
+            not client_id.startswith(INSIDE) or identity.client_id != client_id
+        ):
+            raise ValueError(f"'{client_id}' cannot be the client id of {identity}")
         before = self.sessions.get(client_id)
         if before is not None:
-            if before.identity is None:
+            if before.is_inside:
                 raise ValueError(f"there is a session '{client_id}' already")
             # An old version stored it, which allowed clients such an id; no client can resume it.
             log.warning("the session of %s is ended: its client id is the appliance's own", before)
             self._end(before)
-        session = Session(client_id, None, self.accounting)
+        session = Session(client_id, identity, self.accounting, is_inside=True)
         session.link = link
         self.sessions[client_id] = session
         return session
@@ -555,8 +575,13 @@ class Broker:
     def rules_changed(self) -> None:
         """The access rules changed: clear cached decisions, and check queued messages again."""
         self.router.changed()
+        inside: list[InsideLink] = []
         for session in self.sessions.values():
             session.unchecked = True  # message by message, as they are sent
+            if session.is_inside and isinstance(session.link, InsideLink):
+                inside.append(session.link)
+        for link in inside:
+            self.faults.run("broker.rules", link.rules_changed, otherwise=None)
 
     # --- publishing ----------------------------------------------------------------------------
 
@@ -595,7 +620,7 @@ class Broker:
             self.observer.published(origin, message)
         retain = message.retain
         # If there is no room to retain it, connected subscribers still get it.
-        is_accepted = not retain or self.retained.keep(message, origin.account, refusable)
+        is_accepted = not retain or self.retained.keep(message, self._owner(origin), refusable)
         published_qos = message.qos
         self.counters.cost += 1 + len(targets)
         taken = full = False
@@ -643,6 +668,10 @@ class Broker:
         # subscriber is absent or may not read the topic.
         return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
 
+    def _owner(self, origin: Session) -> Account:
+        """The account that what the session retains is counted for."""
+        return self.accounting.accounts.of(origin.identity) if origin.is_inside else origin.account
+
     def _deliver_shared(
         self, target: Target, message: Message, share: Share, refusable: bool = True
     ) -> bool:
@@ -677,7 +706,7 @@ class Broker:
     def shortage(self, route: Fanout, message: Message, origin: Session) -> str:
         """Why a message found no room (0x97), as a text for its publisher."""
         if message.retain and message.payload:
-            shortage = self.retained.shortage(message, origin.account)
+            shortage = self.retained.shortage(message, self._owner(origin))
             if shortage:
                 return f"no room to retain it: {shortage}"
         asked = (session for session, qos, _, _ in route.targets if qos)
@@ -864,7 +893,7 @@ class Broker:
             return ReasonCode.TOPIC_FILTER_INVALID, str(error)
         if session.identity is None:
             return None
-        if topic_filter not in session.subscriptions:
+        if topic_filter not in session.subscriptions and not session.is_inside:
             maximum = self.limits.subscriptions
             if len(session.subscriptions) >= maximum:
                 reason = f"it has {maximum} subscriptions (broker.limits.subscriptions)"
@@ -1108,7 +1137,7 @@ class Broker:
         for session in list(self.sessions.values()):
             if session.link is not None:
                 session.set_will(None)
-                if session.identity is not None:
+                if not session.is_inside:
                     self.faults.run("stop.session", close, session, otherwise=None)
         self.flush()
 

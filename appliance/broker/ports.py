@@ -222,6 +222,12 @@ class InsideLink:
     def close(self, reason: ReasonCode, message: str) -> None:
         """Do nothing: there is no connection."""
 
+    def rules_changed(self) -> None:
+        """The access rules may have changed: subscriptions are neither ended nor granted anew.
+
+        What the session may publish and receive is decided by the new rules already.
+        """
+
 
 class Store(Protocol):
     """Persistence of sessions and retained messages across restarts.

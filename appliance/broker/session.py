@@ -98,8 +98,9 @@ def _wrong(kind: str, packet_id: int) -> ProtocolError:
 class Session:
     """The session state of a client id (3.1.1 section 3.1.1, 5.0 section 4.1).
 
-    `identity` is None for a session inside the appliance, which has all rights. `expiry` is the
-    time in seconds for which the session outlives its connection.
+    A session inside the appliance belongs to one of its parts (`Broker.attach`); if it has no
+    `identity`, it has all rights. `expiry` is the time in seconds for which the session outlives
+    its connection.
     """
 
     __slots__ = (
@@ -119,6 +120,7 @@ class Session:
         "identity",
         "inflight",
         "is_full_logged",
+        "is_inside",
         "large",
         "latest",
         "link",
@@ -137,12 +139,21 @@ class Session:
         "window",
     )
 
-    def __init__(self, client_id: str, identity: Identity | None, accounting: Accounting) -> None:
+    def __init__(
+        self,
+        client_id: str,
+        identity: Identity | None,
+        accounting: Accounting,
+        *,
+        is_inside: bool = False,
+    ) -> None:
         self.client_id = client_id
         self.identity = identity
+        self.is_inside = is_inside
         self.accounting = accounting
-        #: The account of its user, in which its memory is counted.
-        self.account = accounting.accounts.of(identity)
+        #: The account in which its memory is counted: its user's, or the appliance's own.
+        accounts = accounting.accounts
+        self.account = accounts.inside if is_inside else accounts.of(identity)
         self.link: Link | None = None
         self.expiry = 0
         #: When its connection began, in seconds of the broker's clock.
@@ -804,7 +815,7 @@ class Session:
         return self.fits(size)
 
     def _congest(self) -> None:
-        if self.link is not None and self.identity is not None:
+        if self.link is not None and not self.is_inside:
             self.congestion = Congestion(self, self.accounting)
 
     def _relieve(self, congestion: Congestion) -> None:

@@ -61,7 +61,7 @@ class SysTopics:
         broker = self._broker
         counters = broker.counters
         connected = len(broker.clients)
-        total = sum(1 for session in broker.sessions.values() if session.identity is not None)
+        total = sum(1 for session in broker.sessions.values() if not session.is_inside)
         stored = len(broker.retained) + sum(
             len(session.queue) + sum(delivery is not None for delivery in session.inflight.values())
             for session in broker.sessions.values()

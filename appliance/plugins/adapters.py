@@ -85,7 +85,7 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
 
     def __getitem__(self, client_id: str) -> tuple[AmqttSession, None]:
         session = self._broker.sessions[client_id]
-        if session.identity is None:
+        if session.is_inside:
             raise KeyError(client_id)
         return self.of(session), None
 
@@ -99,7 +99,7 @@ class SessionViews(Mapping[str, tuple[AmqttSession, None]]):
 
     def __contains__(self, client_id: object) -> bool:
         session = self._broker.sessions.get(cast(str, client_id))
-        return session is not None and session.identity is not None
+        return session is not None and not session.is_inside
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

@@ -301,7 +301,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         """The subscriptions of all network clients by topic filter, as they are now."""
         found: dict[str, list[tuple[AmqttSession, int]]] = {}
         for session in self.broker.sessions.values():
-            if session.identity is not None:
+            if not session.is_inside:
                 for topic_filter, subscription in session.subscriptions.items():
                     entry = self._views.of(session), int(subscription.qos)
                     found.setdefault(topic_filter, []).append(entry)
@@ -361,7 +361,7 @@ class ApplianceBroker(amqtt.broker.Broker):
         """
         topic_filter, qos = subscription
         ours = self.broker.sessions.get(session.client_id or "")
-        if ours is None or ours.identity is None:
+        if ours is None or ours.is_inside:
             raise BrokerError(f"there is no session '{session.client_id}'")
         with self._unobserved():
             code, _ = self.broker.subscribe(ours, Subscription(topic_filter, qos))

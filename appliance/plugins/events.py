@@ -109,7 +109,7 @@ class PluginEvents:
 
     def subscribed(self, session: Session, topic_filter: str, qos: int) -> None:
         """A client has subscribed."""
-        if session.identity is not None:
+        if not session.is_inside:
             self._notify(
                 BrokerEvents.CLIENT_SUBSCRIBED,
                 client_id=session.client_id,
@@ -119,14 +119,14 @@ class PluginEvents:
 
     def unsubscribed(self, session: Session, topic_filter: str) -> None:
         """A client has unsubscribed."""
-        if session.identity is not None:
+        if not session.is_inside:
             self._notify(
                 BrokerEvents.CLIENT_UNSUBSCRIBED, client_id=session.client_id, topic=topic_filter
             )
 
     def published(self, session: Session, message: Message) -> None:
         """A client's message is about to be delivered."""
-        if session.identity is None:
+        if session.is_inside:
             return
         if message.retain:
             self._published = message, session
@@ -135,7 +135,7 @@ class PluginEvents:
 
     def refused(self, session: Session, message: Message) -> None:
         """A client's message is not allowed and dropped; amqtt fires that it was received."""
-        if session.identity is not None and self._wants_messages:
+        if not session.is_inside and self._wants_messages:
             self._notify_message(session, message, allowed=False)
 
     def retained(self, message: Message) -> None:

@@ -516,7 +516,7 @@ def check_users(broker: Broker, retained: list[Message], wires_of: Mapping[Accou
     accounts = broker.accounting.accounts
     sessions, queued, kept = Counter[Account](), Counter(wires_of), Counter[Account]()
     for session in broker.sessions.values():
-        account = accounts.of(session.identity)
+        account = accounts.inside if session.is_inside else accounts.of(session.identity)
         assert session.account is account
         queued[account] += session.bytes
         if not account.is_inside:
@@ -569,11 +569,11 @@ def broker(access: FakeAccess, store: FakeStore, limits: Limits) -> Iterator[Bro
     yield broker
     check_accounts(broker)
     for session in list(broker.sessions.values()):
-        if session.link is not None and session.identity is not None:
+        if session.link is not None and not session.is_inside:
             session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "")
     broker.tick(broker.now + 2 * broker.limits.session_expiry + 1)
     check_accounts(broker)
-    if all(session.identity is None for session in broker.sessions.values()):
+    if all(session.is_inside for session in broker.sessions.values()):
         assert broker.accounting.queued_bytes == broker.accounting.input_bytes
 
 

@@ -34,10 +34,10 @@ from appliance.app.main import App
 from appliance.broker import client as network_client
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, Refusal
+from appliance.broker.ports import Action, Decision, Identity, InsideLink, Refusal
 from appliance.config import Settings, load
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Connect, Will
+from appliance.mqtt.packets import Connect, Subscription, Will
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.listeners import Admission, Listeners, ListenerSettings
 from appliance.plugins import (
@@ -858,6 +858,17 @@ async def test_what_the_appliance_publishes_is_no_event(amqtt_users: dict[str, A
         await rig.context.broadcast_message("a", b"x")
         await rig.context.retain_message("b", b"x")
         rig.broker.publish(Message("$SYS/x", b"1", 0, True), rig.frame._inside)  # type: ignore[arg-type]
+        # Nor what a part of it does as a user, such as a link to a fleet's broker.
+        name = "_upstream.fleet"
+        session = rig.broker.attach(name, InsideLink(), Identity("bob", name))
+        assert not rig.broker.subscribe(session, Subscription("c"))[0]
+        assert rig.broker.publish(Message("c", b"x"), session) == 0
+        assert rig.broker.publish(Message("$no", b"x"), session) == ReasonCode.NOT_AUTHORIZED
+        assert rig.context.get_session(name) is None and not list(rig.context.sessions)
+        assert not rig.context.subscriptions
+        with pytest.raises(BrokerError, match="no session"):
+            await rig.context.add_subscription(name, "d", 0)
+        assert told("broker_client_subscribed") == []
         await rig.frame.plugins_manager.wait_fired_events()
         assert told("broker_message_received") == []
         [arguments] = told("broker_retained_message")

@@ -40,7 +40,7 @@ def size_of(payload: bytes) -> int:
 
 def user_of(who: Who) -> str | None:
     """The user of a session; None for all anonymous ones."""
-    return None if who is None else who.account.username
+    return None if who is None or who.identity is None else who.identity.username
 
 
 @dataclass(frozen=True, slots=True)
