@@ -48,7 +48,8 @@ from appliance.mqtt.codec import (
     quote,
     text_size,
 )
-from appliance.mqtt.connection import PUBACK, PUBREC, PUBREL, Event, RawPublish, ServerProtocol
+from appliance.mqtt.connection import ServerProtocol
+from appliance.mqtt.framing import PUBACK, PUBREC, PUBREL, Event, RawPublish
 from appliance.mqtt.packets import (
     Auth,
     Connack,

@@ -1,89 +1,25 @@
-"""The server side of one MQTT connection: framing, size limits, topic aliases and packet order.
+"""The server side of one MQTT connection: which packets a client may send when, and how large.
 
-`ServerProtocol` takes received bytes and yields events. It does no I/O and has no clock. There are
-three kinds of event:
-
-* a `Packet`, decoded;
-* a `RawPublish`, a PUBLISH without properties that is taken apart but not wrapped: the data path;
-* an `int`, ``type << 16 | packet id``: an acknowledgement without reason code or properties.
-
-The two short forms save creating an object and a property table for each message. They are used
-only where properties and reason code are absent; `tests/mqtt/test_connection.py` compares them with
-the full decoder.
+`ServerProtocol` takes received bytes and yields events, see `PacketFramer`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from enum import Enum
-from typing import TypeAlias
-
-from appliance.mqtt.codec import V31, V311, PacketType, Property, decode_varint, text_size
-from appliance.mqtt.packets import Connect, Packet, Publish, decode_packet
+from appliance.mqtt.codec import V31, V311, PacketType, Property
+from appliance.mqtt.framing import (
+    DEFAULT_PAIRS,
+    MAXIMUM_CONNECT,
+    MAXIMUM_CONTROL,
+    UNAUTHENTICATED_PAIRS,
+    PacketFramer,
+    State,
+    check_type,
+)
+from appliance.mqtt.packets import Connect, Packet
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.mqtt.topics import check_topic
-
-#: header byte, topic with its two length bytes, packet id (0 for QoS 0), payload,
-#: and the bytes from the header to the end of the topic (QoS 0: to the end of the packet).
-RawPublish: TypeAlias = tuple[int, bytes, int, bytes, bytes]
-Event: TypeAlias = "Packet | RawPublish | int"
-
-#: The largest packets other than PUBLISH, in bytes. A CONNECT is not authenticated yet: there is
-#: room for a will and some properties, as in mosquitto. Other packets are long lists of filters:
-#: thousands are accepted, but not millions, which would make all other clients wait.
-MAXIMUM_CONNECT = 100_000
-MAXIMUM_CONTROL = 384 * 1024
-
-#: The limit of User Properties in a packet before the login.
-UNAUTHENTICATED_PAIRS = 64
-
-#: The default limit of User Properties in a packet after the login.
-DEFAULT_PAIRS = 1000
-
-PUBACK = PacketType.PUBACK << 16
-PUBREC = PacketType.PUBREC << 16
-PUBREL = PacketType.PUBREL << 16
-PUBCOMP = PacketType.PUBCOMP << 16
-
-# First byte of an acknowledgement -> its event without the packet id.
-_ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
-
 
 #: How the variable header of a CONNECT of MQTT 5 begins.
 _MQTT_5 = b"\0\4MQTT\5"
-
-
-#: A buffered chunk below this size, in bytes, is joined with the next one immediately.
-SMALL_CHUNK = 4096
-
-#: The memory of a topic alias beside its topic, in bytes.
-ALIAS_SIZE = 150
-
-#: The size of an empty User Property, in bytes.
-SHORTEST_PAIR = 5
-
-# The index of the properties in the body of a packet other than PUBLISH; CONNECT has properties in
-# two places.
-_PROPERTIES_AT: dict[int, int] = {
-    PacketType.PUBACK: 3,
-    PacketType.PUBREC: 3,
-    PacketType.PUBREL: 3,
-    PacketType.PUBCOMP: 3,
-    PacketType.SUBSCRIBE: 2,
-    PacketType.UNSUBSCRIBE: 2,
-    PacketType.DISCONNECT: 1,
-    PacketType.AUTH: 1,
-}
-
-
-class State(Enum):
-    """Where a connection is in its life."""
-
-    NEW = "before CONNECT"
-    AUTHENTICATING = "before CONNACK"
-    CONNECTED = "after CONNACK"
-    CLOSED = "after the end"
-
 
 # The packets that a client may send in each state; any other is a protocol error (0x82).
 # [MQTT-3.1.0-1], [MQTT-3.1.0-2]
@@ -117,7 +53,7 @@ _FLAGS_OF_V311 = {
 _FLAGLESS = frozenset({PacketType.SUBACK, PacketType.UNSUBACK, PacketType.PINGRESP})
 
 
-class ServerProtocol:
+class ServerProtocol(PacketFramer):
     """The server side of one MQTT connection, without I/O.
 
     `maximum_packet_size` is the limit of a whole packet, in bytes, after the login;
@@ -132,63 +68,17 @@ class ServerProtocol:
         topic_alias_maximum: int,
         user_properties: int = DEFAULT_PAIRS,
     ) -> None:
-        self.maximum_packet_size = maximum_packet_size
-        self.topic_alias_maximum = topic_alias_maximum
-        self.user_properties = user_properties
-        #: The cost of checking the properties of the last `Packet`, see `Counters.cost`.
-        self.cost = 0
-        self.state = State.NEW
-        self.version = 0
+        super().__init__(
+            State.NEW,
+            maximum_packet_size,
+            topic_alias_maximum,
+            user_properties,
+            with_identifiers=False,
+        )
         #: Whether it is MQTT 3.1, where the first byte of any packet may contain DUP and QoS.
         self._is_v31 = False
-        #: False while no event may be yielded: while paused, and when closed.
-        self._reading = True
         #: Whether its CONNECT has an authentication method, so that AUTH is allowed.
         self.authenticates = False
-        #: Received, unparsed bytes; the chunks are joined when `_need` bytes have arrived.
-        self._chunks: list[bytes] = []
-        self._have = 0
-        self._need = 0
-        self._aliases: dict[int, str] = {}
-        #: Bytes of a CONNECT whose login is not finished.
-        self._connecting = 0
-        #: Bytes of memory of the topic aliases.
-        self._aliased = 0
-        #: The last PUBLISH of the data path: its bytes from the header to the end of the topic, and
-        #: their decoded values. Most clients repeat topic and size: comparing these bytes then
-        #: saves parsing them again.
-        self._head_first = -1
-        self._head = b""
-        self._head_topic = b""
-        self._head_size = 0
-
-    @property
-    def held(self) -> int:
-        """Bytes of memory: unparsed input, a CONNECT until the end of its login, and aliases."""
-        return self._have + self._connecting + self._aliased
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether the buffered bytes are exactly one partial packet."""
-        return self._have > 0 and self._reading
-
-    @property
-    def has_unparsed(self) -> bool:
-        """Whether bytes are buffered that no event has been made of."""
-        return self._have > 0
-
-    @property
-    def paused(self) -> bool:
-        """Whether input is buffered until `accept` or `resume`."""
-        return not self._reading and self.state is not State.CLOSED
-
-    def pause(self) -> None:
-        """Buffer all input until `accept` or `resume`."""
-        self._reading = False
-
-    def resume(self) -> None:
-        """Continue; `receive_data(b"")` yields the events of the buffered input."""
-        self._reading = True
 
     def forget_connect(self) -> None:
         """The login is over: what is stored of the CONNECT is counted elsewhere."""
@@ -200,159 +90,9 @@ class ServerProtocol:
         self._reading = True
         self._connecting = 0
 
-    def close(self) -> None:
-        """Yield no further events, and free all buffers."""
-        self.state = State.CLOSED
-        self._reading = False
-        self._chunks.clear()
-        self._have = 0
-        self._aliases.clear()
-        self._aliased = self._connecting = 0
-
-    def receive_data(self, data: bytes) -> Iterable[Event]:
-        """The events that `data` completes, together with the bytes before it.
-
-        It is parsed during the iteration, so that a change by one packet (refused, paused, closed)
-        applies to the next; the iteration must not be abandoned.
-
-        Raises:
-            ProtocolError: the bytes or their order are wrong; the connection is closed.
-        """
-        # A chunk that is one acknowledgement, or one PUBLISH like the last, needs no generator: for
-        # clients that send one packet at a time that would be a fifth of the cost.
-        size = len(data)
-        if size >= 4 and not self._have and self._reading and self.state is State.CONNECTED:
-            if size == 4 and data[0] in _ACKNOWLEDGEMENTS and data[1] == 2:
-                if data[2] or data[3]:
-                    return (_ACKNOWLEDGEMENTS[data[0]] | data[2] << 8 | data[3],)
-            elif size == self._head_size and data.startswith(self._head):
-                event = self._repeated(data, 0, size)
-                if event is not None:
-                    return (event,)
-        return self._parse(data)
-
-    def _parse(self, data: bytes) -> Iterator[Event]:
-        """The general form of `receive_data`."""
-        if self._have:
-            # The chunks of a packet are joined once, when it is complete: joining at every chunk
-            # would copy a 16 MiB packet a hundred times. Small chunks are joined immediately,
-            # because each object takes many times its bytes.
-            if len(self._chunks[-1]) < SMALL_CHUNK:
-                self._chunks[-1] += data
-            else:
-                self._chunks.append(data)
-            self._have += len(data)
-            if self._have < self._need or not self._reading:
-                return
-            buf = b"".join(self._chunks)
-            self._chunks.clear()
-            self._have = 0
-        else:
-            buf = data
-        pos = 0
-        end = len(buf)
-        need = 2  # bytes of the packet at `pos`, as far as known
-        try:
-            while end - pos >= 2 and self._reading:
-                first = buf[pos]
-                if first == self._head_first and buf.startswith(self._head, pos):
-                    stop = pos + self._head_size
-                    if stop > end:
-                        need = self._head_size
-                        break
-                    event = self._repeated(buf, pos, stop)
-                    if event is not None:
-                        yield event
-                        pos = stop
-                        continue
-                length = buf[pos + 1]
-                body = pos + 2
-                if length > 0x7F:
-                    _check_type(first)
-                    try:
-                        length, body = _remaining_length(buf, pos)
-                    except IndexError:
-                        break
-                stop = body + length
-                if stop - pos > 127 or self.state is not State.CONNECTED:
-                    self._check(first, stop - pos)
-                if stop > end:
-                    need = stop - pos
-                    break
-                if 0x30 <= first <= 0x3D and length > 4:
-                    # The data path: a PUBLISH is parsed by index. One with properties, without a
-                    # topic or with invalid flags goes to the full decoder.
-                    topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
-                    payload = topic_end
-                    packet_id = 0
-                    if first & 6:
-                        payload += 2
-                        if payload <= stop:
-                            packet_id = buf[topic_end] << 8 | buf[topic_end + 1]
-                    if self.version == 5:
-                        payload += 1
-                    if (
-                        payload > stop
-                        or (self.version == 5 and buf[payload - 1])
-                        or topic_end == body + 2
-                        or (not packet_id if first & 6 else first & 8)
-                        or first & 6 == 6
-                    ):
-                        yield self._publish(first, buf[body:stop])
-                    else:
-                        self._head_first = first
-                        self._head = head = buf[pos:topic_end]
-                        self._head_topic = buf[body:topic_end]
-                        self._head_size = stop - pos
-                        yield (
-                            first,
-                            self._head_topic,
-                            packet_id,
-                            buf[payload:stop],
-                            head if packet_id else buf[pos:stop],
-                        )
-                elif length == 2 and first in _ACKNOWLEDGEMENTS and (buf[body] or buf[body + 1]):
-                    yield _ACKNOWLEDGEMENTS[first] | buf[body] << 8 | buf[body + 1]
-                else:
-                    self._check(first, stop - pos)
-                    yield self._decode(first, buf[body:stop])
-                pos = stop
-            if pos < end and self._reading:
-                _check_type(buf[pos])
-        except ProtocolError:
-            self.close()
-            raise
-        if pos < end and self.state is not State.CLOSED:
-            self._chunks.append(buf[pos:] if pos else buf)
-            self._have = end - pos
-            self._need = need
-
-    def _repeated(self, buf: bytes, pos: int, stop: int) -> RawPublish | None:
-        """A PUBLISH with the header and topic of the last; None if it needs the full decoder."""
-        head = self._head
-        first = self._head_first
-        payload = pos + len(head)
-        packet_id = 0
-        if first & 6:
-            packet_id = buf[payload] << 8 | buf[payload + 1]
-            if not packet_id:
-                return None
-            payload += 2
-        if self.version == 5:
-            if buf[payload]:
-                return None
-            payload += 1
-        return (
-            first,
-            self._head_topic,
-            packet_id,
-            buf[payload:stop],
-            head if packet_id else buf[pos:stop],
-        )
-
     def _check(self, first: int, size: int) -> None:
         """Raise ProtocolError if a packet of this type or size is not allowed now."""
-        _check_type(first)
+        check_type(first)
         kind = PacketType(first >> 4)
         if self.state is State.NEW and first == 0x16:
             raise ProtocolError(
@@ -380,12 +120,7 @@ class ServerProtocol:
                 f"{self.maximum_packet_size} (broker.limits.packet_size)",
             )
         limit = MAXIMUM_CONNECT if kind is PacketType.CONNECT else MAXIMUM_CONTROL
-        if size > limit and kind is not PacketType.PUBLISH:
-            raise ProtocolError(
-                ReasonCode.QUOTA_EXCEEDED,
-                f"a {kind.name} of {size} bytes, more than the limit of {limit}",
-                notify_peer=kind is not PacketType.CONNECT,
-            )
+        self._check_size(kind, size, limit)
 
     def _decode(self, first: int, body: bytes) -> Packet:
         if first >> 4 == PacketType.PUBLISH:
@@ -395,9 +130,7 @@ class ServerProtocol:
         if self._is_v31:
             first = first & 0xF0 | _FLAGS_OF_V311.get(first >> 4, 0)
         most = self.user_properties if self.state is State.CONNECTED else UNAUTHENTICATED_PAIRS
-        self.cost = _cost(most, len(body))  # remains if decoding raises
-        packet = decode_packet(first, body, self.version, most)
-        self.cost = _cost(most, _properties_size(first >> 4, body, self.version))
+        packet = self._decode_packet(first, body, most)
         if isinstance(packet, Connect):
             self._is_v31 = packet.version == V31
             self.version = V311 if self._is_v31 else packet.version
@@ -405,71 +138,3 @@ class ServerProtocol:
             self._connecting = len(body)
             self.authenticates = Property.AUTHENTICATION_METHOD in (packet.properties or {})
         return packet
-
-    def _publish(self, first: int, body: bytes) -> Publish:
-        """Decode a PUBLISH fully, resolve its topic alias and check its topic."""
-        most = self.user_properties
-        self.cost = _cost(most, len(body))
-        packet = decode_packet(first, body, self.version, most)
-        assert isinstance(packet, Publish)
-        self.cost = _cost(most, len(packet.passed_on))
-        properties = packet.properties
-        if properties and Property.SUBSCRIPTION_IDENTIFIER in properties:  # [MQTT-3.3.4-6]
-            raise ProtocolError(
-                ReasonCode.PROTOCOL_ERROR, "only a server sends subscription identifiers"
-            )
-        alias = properties.pop(Property.TOPIC_ALIAS, None) if properties else None
-        if isinstance(alias, int):
-            if alias > self.topic_alias_maximum:  # [MQTT-3.3.2-9]
-                raise ProtocolError(
-                    ReasonCode.TOPIC_ALIAS_INVALID,
-                    f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
-                )
-            if packet.topic:
-                before = self._aliases.get(alias)
-                self._aliased += text_size(packet.topic)
-                self._aliased += -text_size(before) if before is not None else ALIAS_SIZE
-                self._aliases[alias] = packet.topic
-            elif alias in self._aliases:
-                packet.topic = self._aliases[alias]
-            else:
-                raise ProtocolError(
-                    ReasonCode.PROTOCOL_ERROR, f"topic alias {alias} was never given a topic"
-                )
-        try:
-            check_topic(packet.topic)  # [MQTT-3.3.2-2], [MQTT-4.7.3-1]
-        except ValueError as error:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
-        return packet
-
-
-def _cost(most: int, size: int) -> int:
-    """The cost of checking properties of `size` bytes with at most `most` User Properties."""
-    return min(most, size // SHORTEST_PAIR) // 2 + (size >> 9)
-
-
-def _properties_size(kind: int, body: bytes, version: int) -> int:
-    """Bytes of properties, at most, in a valid packet other than PUBLISH."""
-    if version != 5:
-        return 0
-    begin = _PROPERTIES_AT.get(kind)
-    if begin is None:
-        return len(body)
-    return decode_varint(body, begin)[0] if begin < len(body) else 0
-
-
-def _check_type(first: int) -> None:
-    if first < 0x10:  # section 2.2.1; 5.0 section 2.1.2
-        raise ProtocolError(ReasonCode.PROTOCOL_ERROR, "packet type 0 is reserved")
-
-
-def _remaining_length(buf: bytes, pos: int) -> tuple[int, int]:
-    """The length of a packet and the index of its body; IndexError if bytes are missing."""
-    # [MQTT-1.5.5-1]: at most four bytes. The available ones are checked before more arrive.
-    if len(buf) - pos < 5 and all(byte & 0x80 for byte in buf[pos + 1 :]):
-        raise IndexError
-    try:
-        return decode_varint(buf, pos + 1)
-    except ProtocolError as error:
-        error.notify_peer = False
-        raise

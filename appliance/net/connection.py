@@ -21,7 +21,7 @@ from appliance.broker.accounts import Account
 from appliance.broker.client import ClientHandler
 from appliance.broker.inflow import PAUSE_BEHIND
 from appliance.broker.ports import LOCAL_PEER, Exchange, Identity, PeerStatus, Refusal, TlsInfo
-from appliance.mqtt.connection import MAXIMUM_CONTROL
+from appliance.mqtt.framing import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.net import lingering, tls

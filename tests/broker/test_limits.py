@@ -14,7 +14,7 @@ from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.rate_limited_log import BURST, INTERVAL
 from appliance.broker.session import REPLAYED_PER_TURN, subscription_size
 from appliance.mqtt.codec import Properties, Property
-from appliance.mqtt.connection import UNAUTHENTICATED_PAIRS
+from appliance.mqtt.framing import UNAUTHENTICATED_PAIRS
 from appliance.mqtt.packets import (
     MAXIMUM_FILTERS,
     Connack,

@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from inputs import Source, chunks, damage
 
 from appliance.mqtt.codec import PacketType, decode_string, decode_varint
-from appliance.mqtt.connection import ALIAS_SIZE, RawPublish, ServerProtocol
+from appliance.mqtt.connection import ServerProtocol
+from appliance.mqtt.framing import ALIAS_SIZE, RawPublish
 from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, decode_packet
 from appliance.mqtt.reason import ProtocolError
 

@@ -16,7 +16,7 @@ from load import BOTH, PATIENCE, ROUND_TRIP, USER, Attack, Line, Load, WebLine, 
 from witness import BINARY, CONTINUATION, PING, PONG, UPGRADE, Over, frame
 
 from appliance.mqtt.codec import Property, encode_varint
-from appliance.mqtt.connection import MAXIMUM_CONTROL
+from appliance.mqtt.framing import MAXIMUM_CONTROL
 from appliance.mqtt.packets import (
     V311,
     Pingreq,

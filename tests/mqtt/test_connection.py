@@ -12,13 +12,8 @@ from hypothesis import strategies as st
 from test_properties import binaries, connects, packets, publishes, topics
 
 from appliance.mqtt.codec import Property, decode_properties, decode_string, encode_varint
-from appliance.mqtt.connection import (
-    MAXIMUM_CONNECT,
-    MAXIMUM_CONTROL,
-    Event,
-    ServerProtocol,
-    State,
-)
+from appliance.mqtt.connection import ServerProtocol
+from appliance.mqtt.framing import MAXIMUM_CONNECT, MAXIMUM_CONTROL, Event, State
 from appliance.mqtt.packets import (
     Auth,
     Connack,

@@ -28,7 +28,7 @@ from websockets.http11 import Response
 from appliance.broker.message import Message
 from appliance.broker.ports import Limits
 from appliance.mqtt.codec import decode_varint
-from appliance.mqtt.connection import MAXIMUM_CONTROL
+from appliance.mqtt.framing import MAXIMUM_CONTROL
 from appliance.mqtt.packets import (
     Connack,
     Connect,
