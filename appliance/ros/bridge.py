@@ -45,14 +45,9 @@ from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_s
 from appliance.ros.topics.commands import Commands
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
 from appliance.ros.topics.factory import FlowFactory
-from appliance.ros.topics.flow import (
-    BridgedTopic,
-    BridgeRoute,
-    Direction,
-    Flow,
-    TopicSettings,
-)
+from appliance.ros.topics.flow import Flow
 from appliance.ros.topics.lease import BRIDGE_CLIENT_ID, Leases
+from appliance.ros.topics.route import BridgedTopic, BridgeRoute, Direction, TopicSettings
 from appliance.ros.topics.staleness import StalenessDetector
 from appliance.ros.topics.to_ros import ToRos, ToRosContext
 
@@ -227,7 +222,7 @@ class Bridge:
             if flows.get(key) is not flow:
                 flow.leave()
                 if not flow.is_matched:  # the follower reports the end of those
-                    flow.route.past.add(flow.counters)
+                    flow.route.past.add(flow.total())
         for key, flow in flows.items():
             known = before.get(key)
             if known is not flow:
@@ -332,9 +327,8 @@ class Bridge:
 
     def topics(self) -> list[TopicStatus]:
         """What is bridged now, with its metrics."""
-        return [
-            topic_status(flow.bridged, flow) for flow in self._flows() if flow.bridged is not None
-        ]
+        flows = [(flow, flow.bridged) for flow in self._flows()]
+        return [topic_status(bridged, flow) for flow, bridged in flows if bridged is not None]
 
     def skips(self) -> list[Skipped]:
         """What routes include and is not bridged, and why."""
@@ -511,7 +505,7 @@ class Bridge:
 
     def on_ended(self, flow: Flow) -> None:
         """A flow that the follower has made is closed: its route goes on with its counters."""
-        flow.route.past.add(flow.counters)
+        flow.route.past.add(flow.total())
 
     def on_bridged_changed(self) -> None:
         """Other topics are bridged, or refused, than before."""

@@ -15,7 +15,7 @@ from appliance.ros.node import BusError, QosProfile, RosNode, RosPublisher
 from appliance.ros.payload.converter import ConversionError, Converter, Converters
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.status import RouteStatus
-from appliance.ros.topics.flow import LogFunction
+from appliance.ros.topics.route import LogFunction
 
 TOPIC = "/diagnostics"
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"

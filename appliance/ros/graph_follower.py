@@ -19,8 +19,10 @@ from appliance.ros.calls.routes import CallPoller
 from appliance.ros.diagnostics import DiagnosticsTopic
 from appliance.ros.node import RosNode
 from appliance.ros.skipped import Skipped
+from appliance.ros.topics.echo import EchoFilter
 from appliance.ros.topics.factory import FlowFactory
-from appliance.ros.topics.flow import BridgeRoute, Direction, EchoFilter, Flow
+from appliance.ros.topics.flow import Flow
+from appliance.ros.topics.route import BridgeRoute, Direction
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import ToRos
 
@@ -168,7 +170,7 @@ class GraphFollower:
             self._share()
         has_changed |= self._poll_flows()
         self._calls.poll_graph()
-        ready = [flow for flow in self._matched.values() if flow.bridged is not None]
+        ready = [flow for flow in self._matched.values() if flow.follower.bridged]
         if ready != self._ready:
             self._ready = ready
             self._post(self._events.on_matched, ready)
@@ -190,7 +192,7 @@ class GraphFollower:
 
     def _lose_flows(self) -> None:
         for flow in self._flows():
-            flow.on_bus_lost()
+            flow.follower.on_bus_lost()
         self._refused = []
         self._share()
 
@@ -219,15 +221,15 @@ class GraphFollower:
         flows = self._flows()
         failures = 0
         for flow in flows:
-            is_thorough = (flow.number + self._polls) % THOROUGH_POLL == 0
+            is_thorough = (flow.follower.number + self._polls) % THOROUGH_POLL == 0
             try:
-                has_changed |= flow.poll_graph(self._node, is_thorough)
+                has_changed |= flow.follower.poll_graph(self._node, is_thorough)
             except Exception as error:
                 failures += 1
                 if failures == len(flows) > 1:
                     raise
                 self._post(self._faults.caught, "bridge.look", error, str(flow))
-                flow.reset(f"a fault in the appliance: {error!r:.200}")
+                flow.follower.reset(f"a fault in the appliance: {error!r:.200}")
         return has_changed
 
     def _follow_routes(self) -> bool:
@@ -243,7 +245,7 @@ class GraphFollower:
         for key, named in ({} if current is None else current.to_ros).items():
             if wanted.to_ros.get(key) is not named:
                 has_changed = True
-                named.close()
+                named.follower.close()
         routes = set(wanted.routes)
         for flow in (*self._to_mqtt.values(), *self._matched.values()):
             is_taken = flow.is_matched and flow.ros in wanted.named[flow.direction]
@@ -274,7 +276,7 @@ class GraphFollower:
         has_changed = False
         for flow in (*self._to_mqtt.values(), *self._matched.values()):
             if flow.is_matched and not flow.route.matches(flow.ros, topics.get(flow.ros, ())):
-                has_changed |= flow.bridged is not None
+                has_changed |= flow.follower.bridged is not None
                 self._end(flow)
         taken: dict[Direction, set[str]] = {
             "to_mqtt": {*current.named["to_mqtt"]} | {flow.ros for flow in self._to_mqtt.values()},
@@ -331,11 +333,15 @@ class GraphFollower:
         there = self._to_mqtt.get(key)
         named = {} if self._current is None else self._current.to_ros
         back = self._matched.get(key) or named.get(key)
-        if there is not None and back is not None and (back.echo is None or there.echo is None):
-            there.echo = back.echo = EchoFilter(self._node.serialization)
+        if there is None or back is None:
+            return
+        if back.follower.echo is None or there.follower.echo is None:
+            echo = EchoFilter(self._node.serialization)
+            there.follower.share_echo(echo)
+            back.follower.share_echo(echo)
 
     def _end(self, flow: Flow) -> None:
-        flow.close()
+        flow.follower.close()
         key = flow.ros, flow.mqtt
         if flow.direction == "to_mqtt":
             del self._to_mqtt[key]

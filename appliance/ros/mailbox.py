@@ -29,6 +29,7 @@ class Lane:
     """The queued messages of one topic; if there are more than `depth`, the oldest is dropped.
 
     `timed` is one of them and the time at which it was published, in nanoseconds since the epoch.
+    `counters` are for the receiver.
     """
 
     depth: int
@@ -37,6 +38,8 @@ class Lane:
     waiting: deque[Message] = field(default_factory=deque)
     #: The queue of lanes that it is in, if any.
     queue: deque[Lane] | None = None
+    #: Messages that were dropped, on either thread: counted under the mailbox's lock.
+    dropped: int = 0
 
 
 class Mailbox:
@@ -130,4 +133,4 @@ class Mailbox:
         message = lane.waiting.popleft()
         self._messages -= 1
         self._bytes -= len(message.payload)
-        lane.counters.dropped += 1
+        lane.dropped += 1

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import accumulate
+from time import monotonic
 
 #: The upper bounds of the latency histogram's buckets, in seconds; one more bucket is for the rest.
 BOUNDS = (
@@ -53,13 +54,32 @@ class Latency:
 
 
 @dataclass(eq=False, slots=True)
-class FlowCounters:
+class ReceiveCounters:
+    """What is counted as messages come from ROS, or do not: on the ROS thread, too.
+
+    `lost` messages were lost by ROS's middleware before they came here, as it reports; `throttled`
+    ones exceeded the rate limit or the byte budget; `errors` could not be converted or published.
+    """
+
+    lost: int = 0
+    throttled: int = 0
+    errors: int = 0
+    last_error: str | None = None
+    #: By `monotonic()`.
+    last_error_at: float = 0.0
+
+    def note_error(self, problem: str) -> None:
+        """Record the last error."""
+        self.last_error = problem
+        self.last_error_at = monotonic()
+
+
+@dataclass(eq=False, slots=True)
+class FlowCounters(ReceiveCounters):
     """The counters of one direction, from the start; `bytes` are payload on MQTT.
 
-    `lost` messages were lost by ROS's middleware before they came here, as it reports; `dropped`
-    ones did not fit into the mailbox; `throttled` ones exceeded the rate limit or the byte budget;
-    `skipped` ones were not sent to a slow client, counted once for each such client; `errors` could
-    not be converted or published. Of commands, `expired` ones came too late, `refused` ones
+    `dropped` messages did not fit into the mailbox; `skipped` ones were not sent to a slow client,
+    counted once for each such client. Of commands, `expired` ones came too late, `refused` ones
     violated the rules, `clamped` ones were published with other numbers; `stops` are stop messages
     that a route has published by itself. `latency` is of a sample of the messages, from the
     publisher's time stamp to the broker.
@@ -67,17 +87,25 @@ class FlowCounters:
 
     messages: int = 0
     bytes: int = 0
-    lost: int = 0
     dropped: int = 0
-    throttled: int = 0
     skipped: int = 0
-    errors: int = 0
     expired: int = 0
     refused: int = 0
     clamped: int = 0
     stops: int = 0
-    last_error: str | None = None
     latency: Latency = field(default_factory=Latency)
+
+    def with_received(self, other: ReceiveCounters) -> FlowCounters:
+        """A copy, with what another thread has counted of the same messages."""
+        last = self if self.last_error_at >= other.last_error_at else other
+        return replace(
+            self,
+            lost=self.lost + other.lost,
+            throttled=self.throttled + other.throttled,
+            errors=self.errors + other.errors,
+            last_error=last.last_error,
+            last_error_at=last.last_error_at,
+        )
 
     def add(self, other: FlowCounters) -> None:
         """Add the counts of others; their last error becomes the last one."""

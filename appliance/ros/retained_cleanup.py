@@ -13,7 +13,7 @@ from appliance.mqtt.codec import Property
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.routes import CallRoutes
 from appliance.ros.patterns import Names
-from appliance.ros.topics.flow import TopicSettings
+from appliance.ros.topics.route import TopicSettings
 
 log = logging.getLogger(__name__)
 

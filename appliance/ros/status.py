@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from appliance.ros.metrics import FlowCounters, Latency
 from appliance.ros.payload.encodings.base import EncodingName
-from appliance.ros.topics.flow import BridgedTopic, BridgeRoute, Direction, Flow, TopicSettings
+from appliance.ros.topics.flow import Flow
+from appliance.ros.topics.route import BridgedTopic, BridgeRoute, Direction, TopicSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +78,7 @@ class RouteStatus:
 
 def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
     """The status of a flow that is bridged."""
-    counters = flow.counters
+    counters = flow.total()
     return TopicStatus(
         bridged.ros,
         bridged.mqtt,
@@ -102,13 +103,13 @@ def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
 def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
     """The status of a route, with its present and past flows."""
     total = FlowCounters()
-    for counters in (route.past, *(flow.counters for flow in flows)):
+    for counters in (route.past, *(flow.total() for flow in flows)):
         total.add(counters)
     rates = [flow.meter.rates for flow in flows]
     return RouteStatus(
         route.settings,
         route.direction,
-        tuple(flow.bridged for flow in flows if flow.bridged is not None),
+        tuple(bridged for flow in flows if (bridged := flow.bridged) is not None),
         total.messages,
         total.bytes,
         total.lost,

@@ -21,7 +21,8 @@ from appliance.ros.calls.routes import ParameterSettings
 from appliance.ros.graph_follower import THOROUGH_POLL
 from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, Reliability
-from appliance.ros.topics.flow import BridgeRoute, EchoFilter
+from appliance.ros.topics.echo import EchoFilter
+from appliance.ros.topics.route import BridgeRoute
 from appliance.store import MemoryStore
 
 pytest.importorskip("std_msgs.msg")
@@ -677,7 +678,7 @@ async def test_both_ways_takes_the_type_from_a_publisher_too(harness):
 
 def test_echo_knows_padding_and_forgets(monkeypatch):
     now = 0.0
-    monkeypatch.setattr("appliance.ros.topics.flow.monotonic", lambda: now)
+    monkeypatch.setattr("appliance.ros.topics.echo.monotonic", lambda: now)
     echo = EchoFilter()
     sample = string("abcd")
     assert not echo.is_own(sample)

@@ -23,8 +23,8 @@ from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.ros1 import node as ros1
 from appliance.ros.ros2 import discovery, installation
 from appliance.ros.ros2 import node as ros2
-from appliance.ros.topics.commands import check_rules
 from appliance.ros.topics.rules import CommandRules
+from appliance.ros.topics.stop_message import check_rules
 
 
 def bridge(settings: Settings) -> Iterator[Finding]:

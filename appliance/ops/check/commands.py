@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from appliance.config import Settings, TopicRoute
 from appliance.ops.finding import Finding
 from appliance.ros.payload.converter import ConversionError, Converter
-from appliance.ros.topics.commands import check_rules
 from appliance.ros.topics.rules import CommandRules
+from appliance.ros.topics.stop_message import check_rules
 
 #: Message types that are a velocity: the robot drives on with the last one until zero stops it.
 _VELOCITIES = {"Twist", "TwistStamped", "AckermannDrive", "AckermannDriveStamped"}

@@ -1,8 +1,8 @@
 """Carries commands that move a robot from MQTT to ROS, with the rules of a route.
 
 Stale commands expire, one client at a time commands, and a stop message is published when that
-client falls silent or leaves. All of it happens on the loop's thread, except for polling the graph
-and what that sets up.
+client falls silent or leaves. All of it happens on the loop's thread; the ROS thread sets up what
+depends on the type, see `CommandPublicationFollower`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,13 +19,15 @@ from appliance.broker.message import Message
 from appliance.broker.ports import LOCAL_PEER, PublishRejection
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
-from appliance.ros.node import BusError, QosProfile, RosNode
-from appliance.ros.payload.converter import ConversionError, Converter, Converters
+from appliance.ros.node import BusError
+from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.payloads import unpacked_size
 from appliance.ros.topics.conversions import LITTLE, size_of
-from appliance.ros.topics.flow import LOG_INTERVAL, BridgeRoute, LogFunction
+from appliance.ros.topics.flow import LOG_INTERVAL
 from appliance.ros.topics.lease import OVERTAKEN, Lease
-from appliance.ros.topics.rules import CommandRules, FieldLimits
+from appliance.ros.topics.publication import CommandPublicationFollower, Outlet
+from appliance.ros.topics.route import BridgeRoute, LogFunction
+from appliance.ros.topics.rules import CommandRules
 from appliance.ros.topics.staleness import (
     QUEUED,
     SENT_AT,
@@ -39,10 +40,6 @@ from appliance.ros.topics.to_ros import RuleViolationError, ToRos, ToRosContext
 
 #: Seconds until a stop message that ROS has not taken is published again.
 RETRY = 0.05
-
-#: Polls of the graph from the first one that finds a subscription until the initial stop message is
-#: published: the two ends have found each other by then.
-POLLS_TO_MATCH = 2
 
 #: Seconds within which the computer of a silent client has to answer: two probes, of which the
 #: first may be sent a second after the silence began. And between two checks for the answer.
@@ -103,53 +100,10 @@ class _Command:
         return self.has_left and not self.why and self.verdict is CommandVerdict.CARRY_OUT
 
 
-class _Stop:
-    """The stop message of a route, for one type."""
-
-    def __init__(self, converter: Converter, payload: str) -> None:
-        """Raises ConversionError when the type has no such message."""
-        self._converter = converter
-        self._payload = payload.encode()
-        self.example = self.cdr()
-        self._says = self._said_by(self.example)
-
-    def cdr(self) -> bytes:
-        """The message, made anew each time: it may contain "now"."""
-        return self._converter.from_json(self._payload)
-
-    def is_like(self, cdr: bytes) -> bool:
-        """Whether a message is equivalent, with another time stamp or frame."""
-        if abs(len(cdr) - len(self.example)) > LITTLE:
-            return False  # no name of a frame is that long
-        try:
-            return self._said_by(cdr) == self._says
-        except ConversionError:  # of another type, from before a reload or another route
-            return False
-
-    def _said_by(self, cdr: bytes) -> dict[str, object]:
-        fields = self._converter.to_dict(cdr)
-        return {name: value for name, value in fields.items() if name != "header"}
-
-
-def check_rules(
-    rules: CommandRules, converter: Converter
-) -> tuple[FieldLimits | None, _Stop | None]:
-    """The limits and the stop message of a route for messages of one type.
-
-    Raises ConversionError when the rules do not fit the type.
-    """
-    limits = FieldLimits(rules, converter) if rules.clamp or rules.allow else None
-    stop = None
-    if rules.on_silence is not None:
-        try:
-            stop = _Stop(converter, rules.on_silence.publish)
-        except ConversionError as error:
-            raise ConversionError("on_silence.publish", str(error)) from None
-    return limits, stop
-
-
 class Commands(ToRos):
     """A flow to ROS with command rules."""
+
+    _follower_type = CommandPublicationFollower
 
     def __init__(
         self,
@@ -162,11 +116,6 @@ class Commands(ToRos):
         super().__init__(route, ros, converters, log, context)
         assert route.settings.rules is not None
         self.rules: CommandRules = route.settings.rules
-        #: For one type; each is replaced as a whole by the ROS thread.
-        self._limits: FieldLimits | None = None
-        self._stop: _Stop | None = None
-        #: Polls that have found a subscription since this publisher was made.
-        self._polls = 0
         #: The client that sent the last command, and when.
         self._source: Session | None = None
         self._commanded_at = -math.inf
@@ -192,27 +141,6 @@ class Commands(ToRos):
         self._awaited: int | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._logged: dict[str, float] = {}
-
-    # The ROS thread
-
-    def poll_graph(self, node: RosNode, thorough: bool) -> bool:
-        has_changed = super().poll_graph(node, thorough)
-        if self._polls < POLLS_TO_MATCH and self._out is not None and node.count(self.ros)[1]:
-            self._polls += 1
-            if self._polls == POLLS_TO_MATCH:
-                self._context.post(self._on_matched)
-        return has_changed
-
-    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
-        rules = self.rules
-        converter = self._converters.get(type_name)
-        self._limits, self._stop = check_rules(rules, converter)
-        # No subscription has found the new publisher yet: as at the route's beginning, a stop
-        # message that it sends now may be lost, and is sent again.
-        self._polls = 0
-        return super()._open(node, type_name, qos, type_hash)
-
-    # The loop's thread
 
     def enter(self, before: ToRos | None) -> None:
         super().enter(before)
@@ -250,10 +178,12 @@ class Commands(ToRos):
         if is_refused and not self._may_stop(message):
             return self._refuse(command, command.why or command.refusal)
         is_kept = retain or (message.retain and self.rules.take_retained)
-        if is_kept and (self._out is None or self._polls < POLLS_TO_MATCH):
-            self._awaited = number
-            self._settle(origin)
-            return None
+        if is_kept:
+            publication = self.follower.publication
+            if publication.outlet is None or not publication.is_found:
+                self._awaited = number
+                self._settle(origin)
+                return None
         size = size_of(message.payload)
         if size <= LITTLE and origin not in self._queued:
             return self._finish(command)
@@ -414,7 +344,7 @@ class Commands(ToRos):
 
     @property
     def _stop_size(self) -> int:
-        stop = self._stop
+        stop = self.follower.publication.stop
         return 0 if stop is None else max(STOP_SIZE, STOP_BYTES * len(stop.example))
 
     def announced(self, message: Message, session: Session) -> None:
@@ -478,13 +408,14 @@ class Commands(ToRos):
         A message whose expiry interval is over is delivered to nobody [MQTT-3.3.2-5], not here
         either.
         """
-        out, expires_at = self._out, message.expires_at
-        if out is None or self._stop is None:
+        publication, expires_at = self.follower.publication, message.expires_at
+        outlet = publication.outlet
+        if outlet is None or publication.stop is None:
             return False
         if expires_at is not None and expires_at <= self._context.broker.now:
             return False
         try:
-            return self.is_stop_message(super()._read(out[0], message, origin))
+            return self.is_stop_message(super()._read(outlet, message, origin))
         except ConversionError:
             return False
 
@@ -595,14 +526,13 @@ class Commands(ToRos):
         else:
             self.counters.refused += 1
 
-    def _read(
-        self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
-    ) -> bytes:
-        cdr = super()._read(convert, message, origin)
-        if self._limits is None:
+    def _read(self, outlet: Outlet, message: Message, origin: Session | None) -> bytes:
+        cdr = super()._read(outlet, message, origin)
+        limits = self.follower.publication.limits
+        if limits is None:
             return cdr
         try:
-            limited, has_changed = self._limits.apply(cdr)
+            limited, has_changed = limits.apply(cdr)
         except ConversionError as error:
             if self.is_stop_message(cdr):
                 return cdr
@@ -619,7 +549,8 @@ class Commands(ToRos):
         lease = self._lease
         self._commanded_at = now
         self._source = origin
-        self._is_driven = self._stop is not None and cdr != self._stop.example
+        stop = self.follower.publication.stop
+        self._is_driven = stop is not None and cdr != stop.example
         if origin is not None and origin.link is not None:
             self._probed.pop(origin, None)
             if self._is_driven:
@@ -699,7 +630,7 @@ class Commands(ToRos):
 
     def is_stop_message(self, cdr: bytes) -> bool:
         """Whether it is the route's stop message, or equivalent to it."""
-        stop = self._stop
+        stop = self.follower.publication.stop
         return stop is not None and (cdr == stop.example or stop.is_like(cdr))
 
     def _is_at_rest(self, cdr: bytes) -> bool:
@@ -798,8 +729,7 @@ class Commands(ToRos):
         if has_closed:
             self._context.broker.flush()
 
-    def _on_matched(self) -> None:
-        """A subscription on ROS has found our publisher."""
+    def on_found(self) -> None:
         if self._is_left:
             return
         if not self._has_stopped:
@@ -823,18 +753,19 @@ class Commands(ToRos):
 
     def _publish_stop(self, why: str) -> None:
         """Publish the stop message now, or as soon as ROS takes it."""
-        out, stop = self._out, self._stop
-        if stop is None or (out is None and self._is_left):
+        publication = self.follower.publication
+        outlet, stop = publication.outlet, publication.stop
+        if stop is None or (outlet is None and self._is_left):
             self._is_driven = False
             return
-        if out is None:  # the publisher is being set up anew
+        if outlet is None:  # the publisher is being set up anew
             self._stop_later()
             return
         try:
             cdr = stop.cdr()
-            if self.echo is not None:
-                self.echo.sent(cdr)
-            out[1].publish(cdr)
+            if publication.echo is not None:
+                publication.echo.sent(cdr)
+            outlet.publisher.publish(cdr)
         except BusError as error:
             self._cannot_stop(error)
             return
@@ -843,7 +774,7 @@ class Commands(ToRos):
             self._cannot_stop(error)
             return
         self._is_driven = self._must_stop = False
-        self._has_stopped = self._polls >= POLLS_TO_MATCH
+        self._has_stopped = self.follower.publication.is_found
         self.counters.stops += 1
         self._log_limited("stopped", "%s: the stop message was published: %s", why)
 

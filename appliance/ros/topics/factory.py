@@ -9,7 +9,7 @@ from appliance.broker.message import Message
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.payload.converter import Converters
 from appliance.ros.topics.commands import Commands
-from appliance.ros.topics.flow import BridgeRoute, LogFunction
+from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import ToRos, ToRosContext
 

@@ -1,20 +1,29 @@
-"""Carries one topic from ROS to MQTT, with its rate limit and its byte budget."""
+"""Carries one topic from ROS to MQTT, with its rate limit and its byte budget.
+
+`SubscriptionFollower` is the ROS thread's part, `ToMqtt` the loop's. Either may be handed messages,
+but never both at once; what they know of the messages before is in `RosMessages`.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from time import monotonic
 
 from appliance.broker.message import CountedMessage, Message
 from appliance.mqtt.codec import Properties, encode_property_list, encode_string
 from appliance.ros.mailbox import LARGE, Lane, Mailbox
-from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription
+from appliance.ros.metrics import FlowCounters, ReceiveCounters
+from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription, TakeBatch
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.payloads import packer
 from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
-from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
+from appliance.ros.topics.echo import EchoFilter
+from appliance.ros.topics.flow import Flow, ProblemLog
+from appliance.ros.topics.follower import TopicFollower
+from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.transforms import TYPES, StaticTransforms
 
 #: Seconds without a message after which a topic with a byte budget counts as silent.
@@ -25,12 +34,167 @@ QUIET = 1.0
 BURST_TOLERANCE = 0.05
 
 
-class ToMqtt(Flow):
-    """A flow from ROS to MQTT: a raw subscription whose messages are converted, throttled and put
-    into the mailbox.
+@dataclass(frozen=True, slots=True)
+class Intake:
+    """How messages from ROS are converted; a snapshot from the ROS thread."""
 
-    `on_message` is called on the ROS thread, `on_batch` on the loop's, never both at once. All else
-    is for the ROS thread.
+    pack: Callable[[bytes], tuple[bytes, Properties]]
+    #: Merges a message with the earlier ones it belongs with, before any is throttled.
+    merge: Callable[[bytes], bytes] | None = None
+    qos: int = 0
+    retain: bool = False
+    #: Whether the publishers retain messages for late subscribers.
+    is_latched: bool = False
+    echo: EchoFilter | None = None
+
+
+class RosMessages:
+    """Converts and throttles the messages of one topic.
+
+    `convert` and `fail` are for the thread that has been handed a message, never both at once, and
+    all else is for the ROS thread. Each thread passes its own counters.
+    """
+
+    def __init__(
+        self,
+        route: BridgeRoute,
+        mqtt: str,
+        lane: Lane,
+        mailbox: Mailbox,
+        counters: ReceiveCounters,
+        problems: ProblemLog,
+    ) -> None:
+        """`counters` are the ROS thread's; those of the loop's thread are the lane's."""
+        settings = route.settings
+        self._mqtt = mqtt
+        self._lane = lane
+        self._mailbox = mailbox
+        self._counters = counters
+        self._problems = problems
+        self._interval = 1 / settings.rate if settings.rate else 0.0
+        self._tolerance = max(0.0, BURST_TOLERANCE - self._interval)
+        self._due = 0.0
+        #: Bytes that may be sent now; negative after a message that was larger.
+        self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
+        self._budget_at = 0.0
+        #: The newest message that was throttled, and when it came. The poll may send it while the
+        #: loop's thread is handed another message: messages are admitted one at a time.
+        self._throttled: tuple[bytes, float] | None = None
+        self._admission = threading.Lock()
+        #: Whether a message was large although its type is not: texts and paths may be.
+        self.is_large = False
+        self._topic_wire = encode_string(mqtt)
+        #: The properties of the last message, most often those of the next, and their bytes.
+        self._properties: Properties = {}
+        self._properties_wire = b""
+
+    def convert(
+        self, intake: Intake, cdr: bytes, published_at: int, counters: ReceiveCounters
+    ) -> Message | None:
+        """The message for MQTT; None for an echo, for a throttled one and one that has failed.
+
+        Nothing may be logged by ROS here: it would feed /rosout.
+        """
+        if len(cdr) > LARGE:
+            self.is_large = True  # the next thorough poll subscribes with a smaller depth
+        if intake.echo is not None and intake.echo.is_own(cdr):
+            return None
+        if intake.merge is not None:
+            try:
+                cdr = intake.merge(cdr)
+            except ConversionError as error:
+                self.fail(f"cannot be converted: {error}", counters)
+                return None
+        if self._interval or self._bytes_per_second:
+            now = monotonic()
+            with self._admission:
+                is_admitted = self._admit(now, counters)
+                self._throttled = None if is_admitted else (cdr, now)
+            if not is_admitted:
+                return None
+        return self._message(intake, cdr, published_at, counters)
+
+    def fail(self, problem: str, counters: ReceiveCounters) -> None:
+        """Count a message that could not be carried, and log that at most once a minute."""
+        counters.errors += 1
+        counters.note_error(problem)
+        self._problems.add(problem, self._counters.errors + self._lane.counters.errors)
+
+    def catch_up(self, intake: Intake) -> None:
+        """Send the throttled message if nothing has come since: a topic's last state is carried."""
+        if self._throttled is None:
+            return
+        now = monotonic()
+        with self._admission:
+            throttled = self._throttled
+            if throttled is None or now < throttled[1] + (self._interval or QUIET):
+                return
+            self._counters.throttled -= 1  # it is counted once only
+            if self._admit(now, self._counters):
+                self._release(intake, throttled[0])
+
+    def send_throttled(self, intake: Intake) -> None:
+        """Send the throttled message although it is early: the flow ends."""
+        with self._admission:
+            if self._throttled is not None:
+                self._counters.throttled -= 1
+                self._release(intake, self._throttled[0])
+
+    def _release(self, intake: Intake, cdr: bytes) -> None:
+        self._throttled = None
+        message = self._message(intake, cdr, 0, self._counters)
+        if message is not None:
+            self._mailbox.put(self._lane, message)
+
+    def _message(
+        self, intake: Intake, cdr: bytes, published_at: int, counters: ReceiveCounters
+    ) -> Message | None:
+        try:
+            payload, properties = intake.pack(cdr)
+        except ConversionError as error:
+            self.fail(f"cannot be converted: {error}", counters)
+            return None
+        if self._bytes_per_second:
+            self._budget -= len(payload)
+        if properties is not self._properties:
+            self._properties, self._properties_wire = properties, encode_property_list(properties)
+        message = CountedMessage(
+            self._mqtt,
+            payload,
+            intake.qos,
+            intake.retain,
+            properties,
+            None,
+            self._topic_wire,
+            self._properties_wire,
+        )
+        message.skip_counter = self._lane.counters
+        if published_at:
+            self._lane.timed = message, published_at
+        return message
+
+    def _admit(self, now: float, counters: ReceiveCounters) -> bool:
+        """Whether a message at that time is within the rate limit, averaged over uneven gaps, and
+        within the byte budget, of which one second can be saved up."""
+        if self._bytes_per_second:
+            saved = self._budget + (now - self._budget_at) * self._bytes_per_second
+            self._budget = min(saved, self._bytes_per_second)
+            self._budget_at = now
+        if now < self._due or self._budget < 0:
+            counters.throttled += 1
+            return False
+        if self._interval:
+            late = now - self._due
+            if late >= self._interval:
+                late = min(late, self._tolerance)
+            self._due = now - late + self._interval
+        return True
+
+
+class SubscriptionFollower(TopicFollower):
+    """Opens and closes the subscription of a flow to MQTT, and takes messages on the ROS thread.
+
+    `intake` is read by the loop's thread.
     """
 
     direction = "to_mqtt"
@@ -43,38 +207,19 @@ class ToMqtt(Flow):
         converters: Converters,
         log: LogFunction,
         mailbox: Mailbox,
-        publish: Callable[[Iterable[tuple[Lane, Message]]], None],
+        lane: Lane,
+        on_batch: TakeBatch,
     ) -> None:
-        """`publish` publishes messages that were received on the loop's thread."""
+        """`on_batch` takes messages on the loop's thread."""
         super().__init__(route, ros, converters, log)
-        settings = route.settings
-        self.echo: EchoFilter | None = None
+        self.intake = Intake(packer(None, "cdr", "none", []))
+        problems = ProblemLog(self, log)
+        self.messages = RosMessages(route, self.mqtt, lane, mailbox, self.counters, problems)
         self._mailbox = mailbox
-        self._publish = publish
-        self._lane = Lane(settings.samples, self.counters)
-        self._interval = 1 / settings.rate if settings.rate else 0.0
-        self._tolerance = max(0.0, BURST_TOLERANCE - self._interval)
-        self._due = 0.0
-        #: Bytes that may be sent now; negative after a message that was larger.
-        self._budget = self._bytes_per_second = float(settings.bytes_per_second or 0)
-        self._budget_at = 0.0
-        #: The newest message that was throttled, and when it came. Both threads admit messages, one
-        #: at a time.
-        self._throttled: tuple[bytes, float] | None = None
-        self._admission = threading.Lock()
+        self._lane = lane
+        self._on_batch = on_batch
         self._subscription: RosSubscription | None = None
-        #: Whether a message was large although its type is not: texts and paths may be.
-        self._is_large = False
-        self._pack: Callable[[bytes], tuple[bytes, Properties]] = packer(None, "cdr", "none", [])
         self._transforms: StaticTransforms | None = None
-        #: Merges a message with the earlier ones it belongs with, before any is throttled.
-        self._merge: Callable[[bytes], bytes] | None = None
-        self._topic_wire = encode_string(self.mqtt)
-        #: The properties of the last message, most often those of the next, and their bytes.
-        self._properties: Properties = {}
-        self._properties_wire = b""
-        self._qos = 0
-        self._retain = False
 
     def __str__(self) -> str:
         return f"{self.ros} → {self.mqtt}"
@@ -84,7 +229,7 @@ class ToMqtt(Flow):
 
     def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
         qos = subscription_qos(endpoints, self._lane.depth, self._converters.bulk(type_name))
-        if self._is_large and not mqtt_retain(
+        if self.messages.is_large and not mqtt_retain(
             qos
         ):  # a latched message would only be received once more
             return subscription_qos(endpoints, self._lane.depth)
@@ -101,22 +246,25 @@ class ToMqtt(Flow):
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))
-        self._pack = packer(converter, settings.encoding, settings.compression, about)
+        pack = packer(converter, settings.encoding, settings.compression, about)
+        is_latched = mqtt_retain(qos)
         wanted_qos, wanted_retain = settings.qos, settings.retain
-        self._qos = mqtt_qos(qos) if wanted_qos is None else wanted_qos
-        self._retain = mqtt_retain(qos) if wanted_retain is None else wanted_retain
-        self._merge = None
-        if type_name in TYPES and self._retain and mqtt_retain(qos):
+        level = mqtt_qos(qos) if wanted_qos is None else wanted_qos
+        retain = is_latched if wanted_retain is None else wanted_retain
+        merge = None
+        if type_name in TYPES and retain and is_latched:
             known = self._transforms or StaticTransforms(self._converters.get(type_name))
-            self._transforms, self._merge = known, known.add
+            self._transforms, merge = known, known.add
+        # Messages come as soon as there is a subscription.
+        self.intake = Intake(pack, merge, level, retain, is_latched, self.intake.echo)
         self._subscription = node.subscribe_raw(
-            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self.on_batch
+            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self._on_batch
         )
-        return f"; MQTT QoS {self._qos}{', retained' if self._retain else ''}"
+        return f"; MQTT QoS {level}{', retained' if retain else ''}"
 
-    def close(self) -> None:
+    def _close(self) -> None:
         self._unsubscribe()
-        self._send_throttled()
+        self.messages.send_throttled(self.intake)
 
     def _unsubscribe(self) -> None:
         self.bridged = None
@@ -129,42 +277,82 @@ class ToMqtt(Flow):
         has_changed = super().poll_graph(node, thorough)
         if thorough and self._subscription is not None:
             self.counters.lost += self._subscription.take_lost()
-        if self._throttled is not None:
-            self._catch_up(monotonic())
+        self.messages.catch_up(self.intake)
         return has_changed
 
     def on_bus_lost(self) -> None:
         super().on_bus_lost()
-        self._send_throttled()
+        self.messages.send_throttled(self.intake)
         self._subscription = self._transforms = None
 
+    @property
+    def echo(self) -> EchoFilter | None:
+        """The echo filter that is shared with the other direction."""
+        return self.intake.echo
+
+    def share_echo(self, echo: EchoFilter) -> None:
+        self.intake = replace(self.intake, echo=echo)
+
     def on_message(self, cdr: bytes, published_at: int = 0) -> None:
-        """Take a message on the ROS thread; `published_at` is known for a few, in nanoseconds since
-        the epoch."""
-        message = self._convert(cdr, published_at)
+        """Take a message; `published_at` is known for a few, in nanoseconds since the epoch."""
+        message = self.messages.convert(self.intake, cdr, published_at, self.counters)
         if message is not None:
             self._mailbox.put(self._lane, message)
 
+
+class ToMqtt(Flow):
+    """A flow from ROS to MQTT, on the loop's thread: takes batches of messages and publishes them.
+
+    Its raw subscription is opened and closed by its follower, which also takes the messages that
+    come on the ROS thread, and puts them into the mailbox.
+    """
+
+    follower: SubscriptionFollower
+
+    def __init__(
+        self,
+        route: BridgeRoute,
+        ros: str,
+        converters: Converters,
+        log: LogFunction,
+        mailbox: Mailbox,
+        publish: Callable[[Iterable[tuple[Lane, Message]]], None],
+    ) -> None:
+        """`publish` publishes messages that were received on the loop's thread."""
+        counters = FlowCounters()
+        self._lane = lane = Lane(route.settings.samples, counters)
+        follower = SubscriptionFollower(route, ros, converters, log, mailbox, lane, self.on_batch)
+        super().__init__(follower, log, counters)
+        self.follower = follower
+        self._messages = follower.messages
+        self._mailbox = mailbox
+        self._publish = publish
+
+    def total(self) -> FlowCounters:
+        total = super().total()
+        total.dropped += self._lane.dropped
+        return total
+
     def on_batch(self, batch: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
-        """Take a batch of messages on the loop's thread and publish it directly.
+        """Take a batch of messages and publish it directly.
 
         Messages that are still in the mailbox go first. Of a late batch only the newest message is
         carried, unless the route keeps more, or they are latched: then each may be the last message
         of another publisher.
         """
-        lane, wanted = self._lane, self._opened_for
-        is_latched = wanted is not None and mqtt_retain(wanted[1])
-        if is_late and lane.depth == 1 and not is_latched:
+        lane, counters = self._lane, self.counters
+        intake, convert = self.follower.intake, self._messages.convert
+        if is_late and lane.depth == 1 and not intake.is_latched:
             lost += len(batch) - 1
             batch = batch[-1:]
-        self.counters.dropped += lost
+        counters.dropped += lost
         messages = []
         failure: Exception | None = None
         for cdr, published_at in batch:
             try:
-                message = self._convert(cdr, published_at)
+                message = convert(intake, cdr, published_at, counters)
             except Exception as error:  # it alone is lost, and raised after the others
-                self.fail(f"ended in a fault: {error!r:.200}")
+                self._messages.fail(f"ended in a fault: {error!r:.200}", counters)
                 failure = error
                 continue
             if message is None:
@@ -177,92 +365,3 @@ class ToMqtt(Flow):
             self._publish(messages)
         if failure is not None:
             raise failure
-
-    def _convert(self, cdr: bytes, published_at: int) -> Message | None:
-        """The message for MQTT; None for an echo, for a throttled one and one that has failed.
-
-        Nothing may be logged by ROS here: it would feed /rosout.
-        """
-        if len(cdr) > LARGE:
-            self._is_large = True  # the next thorough poll subscribes with a smaller depth
-        if self.echo is not None and self.echo.is_own(cdr):
-            return None
-        if self._merge is not None:
-            try:
-                cdr = self._merge(cdr)
-            except ConversionError as error:
-                self.fail(f"cannot be converted: {error}")
-                return None
-        if self._interval or self._bytes_per_second:
-            now = monotonic()
-            with self._admission:
-                is_admitted = self._admit(now)
-                self._throttled = None if is_admitted else (cdr, now)
-            if not is_admitted:
-                return None
-        return self._message(cdr, published_at)
-
-    def _catch_up(self, now: float) -> None:
-        """Send the throttled message if nothing has come since: a topic's last state is carried."""
-        with self._admission:
-            throttled = self._throttled
-            if throttled is None or now < throttled[1] + (self._interval or QUIET):
-                return
-            self.counters.throttled -= 1  # it is counted once only
-            if self._admit(now):
-                self._release(throttled[0])
-
-    def _send_throttled(self) -> None:
-        """Send the throttled message although it is early: the flow ends."""
-        with self._admission:
-            if self._throttled is not None:
-                self.counters.throttled -= 1
-                self._release(self._throttled[0])
-
-    def _release(self, cdr: bytes) -> None:
-        self._throttled = None
-        message = self._message(cdr, 0)
-        if message is not None:
-            self._mailbox.put(self._lane, message)
-
-    def _message(self, cdr: bytes, published_at: int) -> Message | None:
-        try:
-            payload, properties = self._pack(cdr)
-        except ConversionError as error:
-            self.fail(f"cannot be converted: {error}")
-            return None
-        if self._bytes_per_second:
-            self._budget -= len(payload)
-        if properties is not self._properties:
-            self._properties, self._properties_wire = properties, encode_property_list(properties)
-        message = CountedMessage(
-            self.mqtt,
-            payload,
-            self._qos,
-            self._retain,
-            properties,
-            None,
-            self._topic_wire,
-            self._properties_wire,
-        )
-        message.skip_counter = self.counters
-        if published_at:
-            self._lane.timed = message, published_at
-        return message
-
-    def _admit(self, now: float) -> bool:
-        """Whether a message at that time is within the rate limit, averaged over uneven gaps, and
-        within the byte budget, of which one second can be saved up."""
-        if self._bytes_per_second:
-            saved = self._budget + (now - self._budget_at) * self._bytes_per_second
-            self._budget = min(saved, self._bytes_per_second)
-            self._budget_at = now
-        if now < self._due or self._budget < 0:
-            self.counters.throttled += 1
-            return False
-        if self._interval:
-            late = now - self._due
-            if late >= self._interval:
-                late = min(late, self._tolerance)
-            self._due = now - late + self._interval
-        return True

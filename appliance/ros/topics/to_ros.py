@@ -1,10 +1,11 @@
-"""Carries one topic from MQTT to ROS."""
+"""Carries one topic from MQTT to ROS: the part of it on the loop's thread."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -13,14 +14,16 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Property, quote
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries
-from appliance.ros.node import BusError, Endpoint, QosProfile, RosNode, RosPublisher
+from appliance.ros.metrics import FlowCounters
+from appliance.ros.node import BusError
 from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.encodings.registry import ENCODINGS
-from appliance.ros.payload.payloads import unpacker, user_property
-from appliance.ros.qos import publisher_qos
+from appliance.ros.payload.payloads import user_property
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
-from appliance.ros.topics.flow import BridgeRoute, EchoFilter, Flow, LogFunction
+from appliance.ros.topics.flow import Flow, ProblemLog
 from appliance.ros.topics.lease import OVERTAKEN, Lease, Leases
+from appliance.ros.topics.publication import Outlet, PublicationFollower
+from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.staleness import StalenessDetector
 
 #: Reasons that are sent to clients are cut to so many characters.
@@ -48,14 +51,13 @@ class ToRosContext:
 
 
 class ToRos(Flow):
-    """A flow from MQTT to ROS: a ROS publisher.
+    """A flow from MQTT to ROS, on the loop's thread: converts messages and publishes them.
 
-    `enter`, `leave`, `receive`, `fail` and the methods of a broker's Guard are for the loop's
-    thread, all else for the ROS thread.
+    Its publisher is opened and closed by its follower, on the ROS thread.
     """
 
-    direction = "to_ros"
-    absence = "no node subscribes to it, which would tell its type; the route can name it"
+    follower: PublicationFollower
+    _follower_type: ClassVar[type[PublicationFollower]] = PublicationFollower
 
     def __init__(
         self,
@@ -65,54 +67,29 @@ class ToRos(Flow):
         log: LogFunction,
         context: ToRosContext,
     ) -> None:
-        super().__init__(route, ros, converters, log)
+        follower = self._follower_type(route, ros, converters, log, self, context.post)
+        super().__init__(follower, log, FlowCounters())
+        self.follower = follower
+        self._problems = ProblemLog(follower, log)
         self._context = context
         self._is_left = True
-        self.echo: EchoFilter | None = None
         #: The topic's name on ROS, where a remapping gives it another.
         self._name = ros
         self._lease = Lease(ros)
-        #: How to convert, and where to publish; replaced as a whole, as the loop's thread reads it.
-        self._out: tuple[Callable[[bytes], bytes], RosPublisher] | None = None
 
-    def __str__(self) -> str:
-        return f"{self.mqtt} → {self.ros}"
+    def fail(self, problem: str) -> None:
+        """Count a message that could not be carried, and log that at most once a minute."""
+        self.counters.errors += 1
+        self._log_uncarried(problem, self.counters.errors)
 
-    def _find(self, node: RosNode) -> list[Endpoint]:
-        found = node.subscribers(self.ros)
-        if found or self.is_matched:
-            return found
-        if self.settings.type is None and self.settings.to == "both":
-            return node.publishers(self.ros)  # they have the type, too
-        return found
+    def refuse(self, problem: str) -> None:
+        """Count a message that violates the route's rules, and log that at most once a minute."""
+        self.counters.refused += 1
+        self._log_uncarried(problem, self.counters.refused)
 
-    def _choose_qos(self, endpoints: list[Endpoint], type_name: str) -> QosProfile:
-        return publisher_qos(endpoints, self.settings.samples)
-
-    def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
-        settings = self.settings
-        converter = self._converters.get(type_name)
-        ENCODINGS[settings.encoding].check(converter, to_ros=True)
-        unpack = unpacker(converter, settings.encoding, settings.compression, settings.limits)
-        publisher = node.create_publisher(self.ros, type_name, qos)
-        name = node.resolve(self.ros)
-        if name != self._name:
-            self._name = name
-            self._context.post(self._share_lease)
-        before, self._out = self._out, (unpack, publisher)
-        if before is not None:
-            before[1].destroy()
-        return ""
-
-    def close(self) -> None:
-        self.bridged = None
-        before, self._out = self._out, None
-        if before is not None:
-            before[1].destroy()
-
-    def on_bus_lost(self) -> None:
-        super().on_bus_lost()
-        self._out = None
+    def _log_uncarried(self, problem: str, count: int) -> None:
+        self.counters.note_error(problem)
+        self._problems.add(problem, count)
 
     @property
     def takes_retained(self) -> bool:
@@ -164,11 +141,11 @@ class ToRos(Flow):
 
     def _convert(self, message: Message, origin: Session | None) -> bytes | PublishRejection:
         """The message as CDR, or its rejection, which is logged."""
-        out = self._out
-        if out is None:
+        outlet = self.follower.publication.outlet
+        if outlet is None:
             return self._fail_and_reject(message, f"was refused: {self._why_not()}")
         try:
-            return self._read(out[0], message, origin)
+            return self._read(outlet, message, origin)
         except RuleViolationError as error:
             problem = f"was refused: {error}"
             self.refuse(problem)
@@ -181,13 +158,14 @@ class ToRos(Flow):
         self, cdr: bytes, message: Message, origin: Session | None, number: int
     ) -> PublishRejection | None:
         """Publish the converted message on ROS; returns a rejection if that fails."""
-        out = self._out
-        if out is None:
+        publication = self.follower.publication
+        outlet = publication.outlet
+        if outlet is None:
             return self._fail_and_reject(message, f"was refused: {self._why_not()}")
         try:
-            if self.echo is not None:
-                self.echo.sent(cdr)
-            out[1].publish(cdr)
+            if publication.echo is not None:
+                publication.echo.sent(cdr)
+            outlet.publisher.publish(cdr)
         except BusError as error:
             return self._fail_and_reject(message, f"could not be published: {error}")
         finally:  # a stop overtakes earlier commands although ROS has not taken it
@@ -251,25 +229,32 @@ class ToRos(Flow):
         if not self.decide(session):
             self.counters.refused += 1
 
+    # A PublicationListener
+
+    def on_resolved(self, name: str) -> None:
+        """The topic has another name on ROS: share the lease by that one."""
+        self._name = name
+        self._share_lease()
+
+    def on_found(self) -> None:
+        """A subscription on ROS has found our publisher, which only command rules ask for."""
+
     def _share_lease(self) -> None:
         """Share the lease with all flows to the topic, by whatever route and name."""
         self._lease = self._context.leases.of(self._name)
         self._context.broker.guards_changed()
 
-    def _read(
-        self, convert: Callable[[bytes], bytes], message: Message, origin: Session | None
-    ) -> bytes:
+    def _read(self, outlet: Outlet, message: Message, origin: Session | None) -> bytes:
         """The message as CDR. Raises ConversionError, also if its properties state another type."""
         properties = message.properties
         if properties is None:
-            return convert(message.payload)
-        wanted = self._opened_for
+            return outlet.unpack(message.payload)
         claimed = user_property(properties, "ros-type")
-        if wanted is not None and claimed is not None and claimed != wanted[0]:
-            problem = f"it says to be {quote(claimed)}, {self.ros} carries {wanted[0]}"
+        if claimed is not None and claimed != outlet.type:
+            problem = f"it says to be {quote(claimed)}, {self.ros} carries {outlet.type}"
             raise ConversionError("", problem)
         try:
-            return convert(message.payload)
+            return outlet.unpack(message.payload)
         except ConversionError as error:
             stated = properties.get(Property.CONTENT_TYPE)
             encoding = self.settings.encoding
@@ -281,8 +266,9 @@ class ToRos(Flow):
             raise ConversionError(error.path, problem) from None
 
     def _why_not(self) -> str:
-        if self._opened_for is not None:
+        state = self.follower.state
+        if state.type is not None:
             return "its type cannot be bridged"
-        if self._count is None:
+        if not state.is_polled:
             return "ROS is not ready"
         return f"no node subscribes to {self.ros}, which would tell its type; the route can name it"

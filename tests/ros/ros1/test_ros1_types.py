@@ -16,7 +16,7 @@ from appliance.ros.payload.definitions import PACKED, UnknownTypeError
 from appliance.ros.ros1.actions import describe_action, find_actions, to_feedback, to_status
 from appliance.ros.ros1.peers import parse_header
 from appliance.ros.ros1.types import describe, full_name, installed, ros1_name
-from appliance.ros.topics.flow import EchoFilter
+from appliance.ros.topics.echo import EchoFilter
 
 RULE = "\n" + "=" * 80 + "\n"
 STAMPED = f"""\

@@ -7,6 +7,7 @@ import logging
 import math
 import struct
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -640,11 +641,13 @@ async def test_a_stop_message_that_is_due_while_its_publisher_is_set_up_anew(har
     driver = Driver(harness.broker, "a")
     driver.steer()
     (commands,) = bridge._to_ros.values()
-    away, commands._out = commands._out, None
+    follower = commands.follower
+    publication = follower.publication
+    follower.publication = replace(publication, outlet=None)
     driver.cut()
     await asyncio.sleep(0.06)
     assert harness.robot.received == [twist(0.5)]
-    commands._out = away
+    follower.publication = publication
     await until(lambda: harness.robot.received[-1] == STOP)
 
 
@@ -2114,7 +2117,7 @@ async def test_a_stop_that_ros_does_not_take_overtakes_what_has_come(harness, mo
     make_busy(harness)
     a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     a.steer(large(0.1))
-    publisher = harness.commands._out[1]
+    publisher = harness.commands.follower.publication.outlet.publisher
 
     def fail(cdr):
         raise BusError("on purpose")
