@@ -950,6 +950,27 @@ async def test_what_is_taken_on_the_loops_thread_is_on_mqtt_at_once_and_behind_w
     assert harness.status().messages == 3
 
 
+async def test_what_the_two_threads_count_is_added_up_and_logged_once(harness, caplog):
+    harness.node.add_publisher("/a", STRING)
+    harness.start(to_mqtt("/a"))
+    (subscription,) = harness.node.subscriptions
+    subscription.callback(b"no CDR")
+    subscription.on_loop([(b"\0\1\0\0\1", 0), (string("x"), 0)], 2, False)
+    subscription.lost = 3
+    for _ in range(THOROUGH_POLL):
+        harness.node.spin()
+    await harness.settle()
+    status = harness.status()
+    counted = status.messages, status.errors, status.dropped, status.lost
+    assert counted == (1, 2, 2, 3)
+    assert caplog.text.count("a message cannot be converted") == 1
+    (flow,) = harness.bridge._flows()
+    assert (flow.counters.errors, flow.follower.counters.errors) == (1, 1)
+    assert status.last_error == flow.counters.last_error
+    subscription.callback(b"")
+    assert harness.status().last_error == flow.follower.counters.last_error
+
+
 async def test_what_there_was_no_room_for_on_ros_is_counted(harness):
     harness.node.add_publisher("/a", STRING)
     harness.start(to_mqtt("/a", encoding="text"))

@@ -446,7 +446,7 @@ class Commands(ToRos):
             self._log_limited("begins", "%s: of %s: %s", origin, why, level=logging.INFO)
             return
         self.counters.expired += 1
-        self.counters.last_error = f"a command was too old: {why}"
+        self.counters.note_error(f"a command was too old: {why}")
         self._log_limited("expired", "%s: a command of %s was not published: %s", origin, why)
 
     def _hold(self, command: _Command, cdr: bytes, origin: Session) -> PublishRejection | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from abc import ABC
 from time import monotonic
 
 from appliance.ros.metrics import FlowCounters, Meter
@@ -41,7 +40,7 @@ class ProblemLog:
         self._log(logging.WARNING, text, self._flow, problem, count)
 
 
-class Flow(ABC):
+class Flow:
     """Carries one ROS topic in one direction; the loop's thread's part of it.
 
     The attributes that say which topic it is never change. Of `follower`, the loop's thread reads
