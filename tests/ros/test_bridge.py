@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import itertools
 import json
 import logging
 import struct
 import time
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -23,6 +25,7 @@ from appliance.ros.mailbox import LARGE
 from appliance.ros.node import BusError, Durability, FakeNode, Reliability
 from appliance.ros.topics.echo import EchoFilter
 from appliance.ros.topics.route import BridgeRoute
+from appliance.ros.topics.rules import CommandRules, OnSilence
 from appliance.store import MemoryStore
 
 pytest.importorskip("std_msgs.msg")
@@ -926,6 +929,40 @@ async def test_an_echo_is_known_also_when_one_way_came_later(harness):
     harness.client.send("r2d2/a", b'{"data":"x"}')
     await harness.settle()
     assert harness.client.payloads("r2d2/a") == [b'{"data":"x"}']
+
+
+async def test_a_flow_that_has_ended_is_freed_without_the_garbage_collector(harness, caplog):
+    """The appliance never collects old objects: a cycle of references would stay for ever."""
+    caplog.set_level(logging.ERROR)  # pytest's records have the flow that they are about
+    bridge = harness.start(
+        to_mqtt(("/sensor/**",)),
+        to_ros(("/say/**",)),
+        both("/both", type=STRING),
+        to_ros("/cmd_vel", type=TWIST, rules=CommandRules(on_silence=OnSilence(0.1))),
+    )
+    sensor = harness.node.add_publisher("/sensor/a", STRING)
+    harness.node.add_subscriber("/say/a", STRING)
+    harness.node.add_subscriber("/cmd_vel", TWIST)
+    harness.node.add_publisher("/both", STRING).publish(string("1"))
+    sensor.publish(string("2"))
+    harness.client.send("r2d2/cmd_vel", b'{"linear": {"x": 1.0}}')
+    harness.client.send("r2d2/both", b'{"data": "3"}')
+    await harness.settle()
+    flows = [weakref.ref(flow) for flow in bridge._flows()]
+    assert sorted(type(flow()).__name__ for flow in flows) == [
+        *("Commands", "ToMqtt", "ToMqtt", "ToRos", "ToRos")
+    ]
+    gc.disable()
+    try:
+        harness.node.remote_publishers.clear()
+        harness.node.remote_subscribers.clear()
+        bridge.replace([])
+        harness.node.spin()
+        await harness.settle()
+        alive = [str(flow()) for flow in flows if flow() is not None]
+        assert not alive
+    finally:
+        gc.enable()
 
 
 def test_a_closed_loop_is_no_error():

@@ -528,7 +528,7 @@ class Commands(ToRos):
 
     def _read(self, outlet: Outlet, message: Message, origin: Session | None) -> bytes:
         cdr = super()._read(outlet, message, origin)
-        limits = self.follower.publication.limits
+        limits = outlet.limits
         if limits is None:
             return cdr
         try:
@@ -774,7 +774,7 @@ class Commands(ToRos):
             self._cannot_stop(error)
             return
         self._is_driven = self._must_stop = False
-        self._has_stopped = self.follower.publication.is_found
+        self._has_stopped = publication.is_found
         self.counters.stops += 1
         self._log_limited("stopped", "%s: the stop message was published: %s", why)
 

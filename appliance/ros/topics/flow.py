@@ -23,7 +23,7 @@ LOG_INTERVAL = 60.0
 class ProblemLog:
     """Logs messages of a flow that could not be carried, at most once a minute; for any thread."""
 
-    def __init__(self, flow: TopicFollower, log: LogFunction) -> None:
+    def __init__(self, flow: str, log: LogFunction) -> None:
         self._flow = flow
         self._log = log
         self._lock = threading.Lock()

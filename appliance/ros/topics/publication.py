@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -29,20 +30,21 @@ class Outlet:
     type: str
     unpack: Callable[[bytes], bytes]
     publisher: RosPublisher
+    #: Of the command rules, for this type.
+    limits: FieldLimits | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Publication:
     """What a flow to ROS publishes with; a snapshot from the ROS thread.
 
-    The limits and the stop message, which command rules set for a type, stay when the outlet is
-    closed. `is_found` is whether a subscription has had the time to find the outlet's publisher,
-    as far as command rules ask for that.
+    The stop message, which command rules set for a type, stays when the outlet is closed.
+    `is_found` is whether a subscription has had the time to find the outlet's publisher, as far as
+    command rules ask for that.
     """
 
     outlet: Outlet | None = None
     echo: EchoFilter | None = None
-    limits: FieldLimits | None = None
     stop: StopMessage | None = None
     is_found: bool = False
 
@@ -78,8 +80,11 @@ class PublicationFollower(TopicFollower):
         """`post` calls on the loop's thread."""
         super().__init__(route, ros, converters, log)
         self.publication = Publication()
-        self._listener = listener
+        # The flow owns this follower. Only the garbage collector would free a cycle of the two, and
+        # it never looks at old objects (`app/main.py`).
+        self._listener = weakref.ref(listener)
         self._post = post
+        self._limits: FieldLimits | None = None
         #: The topic's name on ROS, where a remapping gives it another.
         self._name = ros
 
@@ -104,10 +109,11 @@ class PublicationFollower(TopicFollower):
         unpack = unpacker(converter, settings.encoding, settings.compression, settings.limits)
         publisher = node.create_publisher(self.ros, type_name, qos)
         name = node.resolve(self.ros)
-        if name != self._name:
+        listener = self._listener()
+        if name != self._name and listener is not None:
             self._name = name
-            self._post(self._listener.on_resolved, name)
-        self._replace(Outlet(type_name, unpack, publisher))
+            self._post(listener.on_resolved, name)
+        self._replace(Outlet(type_name, unpack, publisher, self._limits))
         return ""
 
     def _close(self) -> None:
@@ -156,15 +162,16 @@ class CommandPublicationFollower(PublicationFollower):
         is_open = self.publication.outlet is not None
         if self._polls < POLLS_TO_MATCH and is_open and node.count(self.ros)[1]:
             self._polls += 1
-            if self._polls == POLLS_TO_MATCH:
+            listener = self._listener()
+            if self._polls == POLLS_TO_MATCH and listener is not None:
                 self.publication = replace(self.publication, is_found=True)
-                self._post(self._listener.on_found)
+                self._post(listener.on_found)
         return has_changed
 
     def _open(self, node: RosNode, type_name: str, qos: QosProfile, type_hash: str | None) -> str:
-        limits, stop = check_rules(self._rules, self._converters.get(type_name))
+        self._limits, stop = check_rules(self._rules, self._converters.get(type_name))
         # No subscription has found the new publisher yet: as at the route's beginning, a stop
         # message that it sends now may be lost, and is sent again.
         self._polls = 0
-        self.publication = replace(self.publication, limits=limits, stop=stop, is_found=False)
+        self.publication = replace(self.publication, stop=stop, is_found=False)
         return super()._open(node, type_name, qos, type_hash)

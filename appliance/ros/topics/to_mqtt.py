@@ -7,6 +7,7 @@ but never both at once; what they know of the messages before is in `RosMessages
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -52,7 +53,8 @@ class RosMessages:
     """Converts and throttles the messages of one topic.
 
     `convert` and `fail` are for the thread that has been handed a message, never both at once, and
-    all else is for the ROS thread. Each thread passes its own counters.
+    all else is for the ROS thread, which may send the throttled message at the same time. Each
+    thread passes its own counters.
     """
 
     def __init__(
@@ -84,9 +86,9 @@ class RosMessages:
         #: Whether a message was large although its type is not: texts and paths may be.
         self.is_large = False
         self._topic_wire = encode_string(mqtt)
-        #: The properties of the last message, most often those of the next, and their bytes.
-        self._properties: Properties = {}
-        self._properties_wire = b""
+        #: The properties of the last message, most often those of the next, and their bytes; in one
+        #: tuple, because two threads may replace it.
+        self._last: tuple[Properties, bytes] = ({}, b"")
 
     def convert(
         self, intake: Intake, cdr: bytes, published_at: int, counters: ReceiveCounters
@@ -112,7 +114,11 @@ class RosMessages:
                 self._throttled = None if is_admitted else (cdr, now)
             if not is_admitted:
                 return None
-        return self._message(intake, cdr, published_at, counters)
+        message = self._message(intake, cdr, published_at, counters)
+        if message is not None and self._bytes_per_second:
+            with self._admission:
+                self._budget -= len(message.payload)
+        return message
 
     def fail(self, problem: str, counters: ReceiveCounters) -> None:
         """Count a message that could not be carried, and log that at most once a minute."""
@@ -144,6 +150,8 @@ class RosMessages:
         self._throttled = None
         message = self._message(intake, cdr, 0, self._counters)
         if message is not None:
+            if self._bytes_per_second:
+                self._budget -= len(message.payload)
             self._mailbox.put(self._lane, message)
 
     def _message(
@@ -154,10 +162,10 @@ class RosMessages:
         except ConversionError as error:
             self.fail(f"cannot be converted: {error}", counters)
             return None
-        if self._bytes_per_second:
-            self._budget -= len(payload)
-        if properties is not self._properties:
-            self._properties, self._properties_wire = properties, encode_property_list(properties)
+        known, wire = self._last
+        if properties is not known:
+            wire = encode_property_list(properties)
+            self._last = properties, wire
         message = CountedMessage(
             self._mqtt,
             payload,
@@ -166,7 +174,7 @@ class RosMessages:
             properties,
             None,
             self._topic_wire,
-            self._properties_wire,
+            wire,
         )
         message.skip_counter = self._lane.counters
         if published_at:
@@ -210,14 +218,16 @@ class SubscriptionFollower(TopicFollower):
         lane: Lane,
         on_batch: TakeBatch,
     ) -> None:
-        """`on_batch` takes messages on the loop's thread."""
+        """`on_batch`, a method of the flow, takes messages on the loop's thread."""
         super().__init__(route, ros, converters, log)
         self.intake = Intake(packer(None, "cdr", "none", []))
-        problems = ProblemLog(self, log)
+        problems = ProblemLog(str(self), log)
         self.messages = RosMessages(route, self.mqtt, lane, mailbox, self.counters, problems)
         self._mailbox = mailbox
         self._lane = lane
-        self._on_batch = on_batch
+        # The flow owns this follower. Only the garbage collector would free a cycle of the two, and
+        # it never looks at old objects (`app/main.py`).
+        self._on_batch = weakref.WeakMethod(on_batch)
         self._subscription: RosSubscription | None = None
         self._transforms: StaticTransforms | None = None
 
@@ -258,7 +268,7 @@ class SubscriptionFollower(TopicFollower):
         # Messages come as soon as there is a subscription.
         self.intake = Intake(pack, merge, level, retain, is_latched, self.intake.echo)
         self._subscription = node.subscribe_raw(
-            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self._on_batch
+            self.ros, type_name, qos, self.on_message, timed=True, on_loop=self._on_batch()
         )
         return f"; MQTT QoS {level}{', retained' if retain else ''}"
 

@@ -70,7 +70,7 @@ class ToRos(Flow):
         follower = self._follower_type(route, ros, converters, log, self, context.post)
         super().__init__(follower, log, FlowCounters())
         self.follower = follower
-        self._problems = ProblemLog(follower, log)
+        self._problems = ProblemLog(str(follower), log)
         self._context = context
         self._is_left = True
         #: The topic's name on ROS, where a remapping gives it another.
