@@ -49,6 +49,7 @@ NEEDS_RESTART: Final = (
     "bridge.ros_arguments",
     "bridge.use_sim_time",
     "bridge.diagnostics",
+    "upstreams",
 )
 
 

@@ -14,6 +14,7 @@ from appliance.config.printing import (
     is_open_with_secrets,
     mask,
     secrets_in,
+    secrets_of,
 )
 from appliance.config.quantities import (
     Bind,
@@ -39,7 +40,9 @@ from appliance.config.settings import (
     Settings,
     TlsSection,
     TopicRoute,
+    UpstreamSection,
 )
+from appliance.config.urls import ProxyUrl, ServerUrl, parse_proxy
 from appliance.config.values import Level
 
 __all__ = [
@@ -57,11 +60,14 @@ __all__ = [
     "Listener",
     "OnSilenceSection",
     "ParameterRoute",
+    "ProxyUrl",
     "Route",
+    "ServerUrl",
     "ServiceRoute",
     "Settings",
     "TlsSection",
     "TopicRoute",
+    "UpstreamSection",
     "about_size",
     "describe",
     "find",
@@ -74,6 +80,8 @@ __all__ = [
     "mask",
     "parse_bind",
     "parse_duration",
+    "parse_proxy",
     "parse_size",
     "secrets_in",
+    "secrets_of",
 ]

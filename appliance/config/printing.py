@@ -9,7 +9,10 @@ from typing import Any
 from appliance.config.settings import Settings
 from appliance.config.yaml_document import KeyPath
 
-_SECRET_KEY = re.compile(r"(?i)pass(word|wd|phrase)?$|secret|token|credential|api_?key|private")
+# The name of a file with a secret in it is none.
+_SECRET_KEY = re.compile(
+    r"(?i)(?!.*_file$)(.*pass(word|wd|phrase)?$|.*(secret|token|credential|api_?key|private))"
+)
 
 
 # Up to the last @ of a word, because passwords may contain a slash or an @.
@@ -38,7 +41,7 @@ def mask(path: KeyPath, value: Any) -> Any:
 def _is_secret(path: KeyPath) -> bool:
     """Whether a key of the path names a secret: `tokens: {alice: …}`; plugins' names do not."""
     return any(
-        isinstance(part, str) and "." not in part and _SECRET_KEY.search(part) for part in path
+        isinstance(part, str) and "." not in part and _SECRET_KEY.match(part) for part in path
     )
 
 
@@ -72,10 +75,16 @@ def is_open_with_secrets(settings: Settings) -> bool:
     except (OSError, UnicodeDecodeError):
         return False
     # Secrets from environment variables are not in the file.
-    return any(secret in text for secret in secrets_in(settings.broker.plugins))
+    return any(secret in text for secret in secrets_of(settings))
+
+
+def secrets_of(settings: Settings) -> Iterator[str]:
+    """All secrets of the settings: of plugins, and the passwords of proxies."""
+    yield from secrets_in(settings.broker.plugins)
+    yield from secrets_in([upstream.proxy for upstream in settings.upstreams])
 
 
 def describe(settings: Settings) -> dict[str, Any]:
     """All settings as plain values, structured as in appliance.yaml, with secrets masked."""
-    described: dict[str, Any] = mask((), settings.model_dump(mode="json"))
+    described: dict[str, Any] = mask((), settings.model_dump(mode="json", by_alias=True))
     return described

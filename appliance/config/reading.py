@@ -15,6 +15,7 @@ from pydantic import (
     BeforeValidator,
     ValidationError,
 )
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from appliance.config.printing import mask
@@ -28,15 +29,19 @@ from appliance.config.quantities import (
 from appliance.config.settings import (
     ActionRoute,
     BridgeSection,
+    InSection,
+    MappedTopicsSection,
     ParameterRoute,
     Route,
     ServiceRoute,
     Settings,
     TopicRoute,
+    UpstreamSection,
 )
 from appliance.config.values import OF_NODE, InListError, ValueEncoding
 from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument
 from appliance.host.environment import of_service
+from appliance.mqtt.topics import check_filter, overlaps
 
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
 """Default locations of the configuration; the first file that exists is used."""
@@ -164,6 +169,121 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
     yield from _cross_check_called(settings.bridge)
     yield from _cross_check_bus(settings.bridge)
+    for number, upstream in enumerate(settings.upstreams):
+        for inside, problem in _cross_check_upstream(settings, number, upstream):
+            yield ("upstreams", number, *inside), problem
+
+
+def _cross_check_upstream(
+    settings: Settings, number: int, upstream: UpstreamSection
+) -> Iterator[tuple[KeyPath, str]]:
+    """Settings of a link that do not fit each other; paths are those within it."""
+    first = [each.name for each in settings.upstreams].index(upstream.name)
+    if first != number:
+        yield ("name",), f"is the name of upstreams[{first}]"
+    if upstream.prefix.startswith("$") and not _is_of_aws(upstream, upstream.prefix):
+        yield ("prefix",), _DOLLAR
+    yield from _cross_check_login(upstream)
+    tls = upstream.tls
+    if (tls.certificate is None) is not (tls.key is None):
+        here, other = ("key", "certificate") if tls.key else ("certificate", "key")
+        yield ("tls", here), f"needs {other} beside it"
+    yield from _cross_check_mapped(settings.robot, upstream)
+
+
+#: Why topics at the fleet's broker do not begin with `$`.
+_DOLLAR = "must not begin with '$': those topics are the server's own ($aws/ with kind: aws-iot)"
+
+
+def _is_of_aws(upstream: UpstreamSection, prefix: str) -> bool:
+    return upstream.kind == "aws-iot" and prefix.startswith("$aws/")
+
+
+def _cross_check_login(upstream: UpstreamSection) -> Iterator[tuple[KeyPath, str]]:
+    login, is_old = upstream.login, upstream.version == "3.1.1"
+    if login.password_file is not None and login.token_file is not None:
+        yield ("login", "token_file"), "is sent as the password: leave password_file out"
+    if login.method is not None:
+        if login.token_file is None:
+            yield ("login", "method"), "needs token_file, which it authenticates with"
+        if is_old:
+            yield ("login", "method"), 'is of MQTT 5: it needs version: "5"'
+    secret = "password_file" if login.password_file is not None else "token_file"
+    if is_old and login.username is None and getattr(login, secret) is not None:
+        yield ("login", secret), "needs username: MQTT 3.1.1 has no password without one"
+
+
+def _cross_check_mapped(robot: str, upstream: UpstreamSection) -> Iterator[tuple[KeyPath, str]]:
+    """The filters of rules, which are valid with their prefixes only."""
+    directions: dict[str, Sequence[MappedTopicsSection]] = {
+        "out": upstream.out,
+        "in": upstream.inward,
+    }
+    there: dict[str, list[str]] = {"out": [], "in": []}
+    for direction, rules in directions.items():
+        seen: dict[str, int] = {}
+        for number, rule in enumerate(rules):
+            path: KeyPath = (direction, number)
+            if isinstance(rule, InSection) and rule.offline == "keep" and rule.late is not None:
+                text = "is not for offline: keep: how long the server has queued it nobody says"
+                yield (*path, "late"), text
+            filters = rule.local_filter(robot), rule.remote_filter(robot, upstream.prefix)
+            there[direction].append(filters[1])
+            problem = _mistake_in_filters(rule, *filters)
+            if problem:
+                yield (*path, "topic"), problem
+                continue
+            if direction == "in" and filters[0].startswith("$"):
+                yield (
+                    (*path, "topic"),
+                    "must not begin with '$' here: those topics are the broker's",
+                )
+            remote = rule.prefix_there(robot, upstream.prefix)
+            if filters[1].startswith("$") and not _is_of_aws(upstream, remote):
+                key = "topic" if rule.remote_prefix is None else "remote_prefix"
+                if rule.remote_prefix is not None or not upstream.prefix.startswith("$"):
+                    yield (*path, key), _DOLLAR
+            read = filters[direction == "in"]
+            first = seen.setdefault(read, number)
+            if first != number:
+                yield (*path, "topic"), f"is the same as in {direction}[{first}], which carries it"
+    if upstream.version == "3.1.1":
+        yield from _cross_check_loops(there["out"], there["in"])
+
+
+def _mistake_in_filters(rule: MappedTopicsSection, local: str, remote: str) -> str:
+    if rule.topic.startswith("/") and local != rule.topic and "//" in local + remote:
+        return (
+            f"must not begin with '/' behind {rule.local_prefix}; did you mean {rule.topic[1:]!r}?"
+        )
+    for filter, side in ((local, "here"), (remote, "at the fleet's broker")):
+        try:
+            check_filter(filter)
+        except ValueError as error:
+            return f"makes no topic filter {side}, {filter!r}: {error}"
+        if filter.startswith("$share/"):
+            return f"makes a shared subscription {side}, {filter!r}, which is not carried"
+    return ""
+
+
+def _cross_check_loops(out: list[str], inward: list[str]) -> Iterator[tuple[KeyPath, str]]:
+    for number, filter in enumerate(inward):
+        for position, other in enumerate(out):
+            if _is_filter(filter) and _is_filter(other) and overlaps(filter, other):
+                text = (
+                    f"overlaps out[{position}] at the fleet's broker ({filter} and {other}): what "
+                    "is sent would come back, as MQTT 3.1.1 has no No Local; use "
+                    'version: "5", or topics that share nothing'
+                )
+                yield ("in", number, "topic"), text
+
+
+def _is_filter(text: str) -> bool:
+    try:
+        check_filter(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _cross_check_bus(bridge: BridgeSection) -> Iterator[tuple[KeyPath, str]]:
@@ -268,6 +388,7 @@ _PLAIN = {
     "list_type": "must be a list",
     "dict_type": "must be keys with values",
     "model_type": "must be keys with values",
+    "string_too_short": "must not be empty",
 }
 
 
@@ -293,7 +414,7 @@ def _explain(detail: ErrorDetails, written: str | None) -> str:
     """The text for one of pydantic's errors, with the value as written in the file, masked."""
     kind, path, context = detail["type"], detail["loc"], detail.get("ctx", {})
     if kind == "extra_forbidden":
-        known = list(_section_at(path[:-1]).model_fields)
+        known = list(_keys(_section_at(path[:-1])))
         return f"unknown key{_did_you_mean(str(path[-1]), known) or '; known: ' + ', '.join(known)}"
     if kind == "missing":
         return _PLAIN[kind]
@@ -326,13 +447,18 @@ def _section_at(path: KeyPath) -> type[BaseModel]:
     section: type[BaseModel] = Settings
     for part in path:
         if isinstance(part, str):
-            section = next(models(section.model_fields[part].annotation))
+            section = next(models(_keys(section)[part].annotation))
     return section
+
+
+def _keys(section: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The keys of a section as they are in the file."""
+    return {field.alias or name: field for name, field in section.model_fields.items()}
 
 
 def _with_unit(value: float, path: KeyPath) -> str:
     *around, name = path
-    for item in _section_at(tuple(around)).model_fields[str(name)].metadata:
+    for item in _keys(_section_at(tuple(around)))[str(name)].metadata:
         if item == BeforeValidator(parse_size):
             return format_size(int(value))
         if item == BeforeValidator(parse_seconds):

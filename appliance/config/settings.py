@@ -31,6 +31,7 @@ from appliance.config.quantities import (
     Size,
     parse_path,
 )
+from appliance.config.urls import Proxy, Server
 from appliance.config.values import (
     CallEncoding,
     ClientCertificates,
@@ -41,6 +42,7 @@ from appliance.config.values import (
     Keep,
     Level,
     ParameterNames,
+    ProtocolVersion,
     Qos,
     QueueFull,
     Retain,
@@ -50,17 +52,22 @@ from appliance.config.values import (
     check_action_type,
     check_allow,
     check_clamp,
+    check_client_id,
     check_direction,
+    check_fleet_prefix,
+    check_login_name,
     check_message,
     check_namespace,
     check_node,
     check_node_topic,
     check_plugins,
+    check_relative_filter,
     check_response_information,
     check_robot,
     check_ros_arguments,
     check_ros_type,
     check_service_type,
+    check_topic_prefix,
     check_topic_template,
     excludes_only,
     from_names,
@@ -460,6 +467,94 @@ class BridgeSection(_Section):
         return [route if route.is_exclusion else completed(route) for route in topics]
 
 
+class UpstreamLoginSection(_Section):
+    """How a link authenticates at the fleet's broker; secrets are in files of their own."""
+
+    username: Annotated[str, AfterValidator(check_login_name)] | None = None
+    password_file: OptionalPath = None
+    token_file: OptionalPath = None
+    method: Annotated[str, Field(min_length=1)] | None = None
+
+
+class UpstreamTlsSection(_Section):
+    """TLS of a link: `ca` defaults to the system's, `server_name` to the host in the URL."""
+
+    ca: OptionalPath = None
+    certificate: OptionalPath = None
+    key: OptionalPath = None
+    server_name: Annotated[str, Field(min_length=1)] | None = None
+    alpn: list[Annotated[str, Field(min_length=1, max_length=255)]] = []
+
+
+class BacklogSection(_Section):
+    """What waits for a link; `size` in bytes, `age` in seconds."""
+
+    size: Annotated[Size, Field(ge=1 << 20)] = 256 << 20
+    age: Annotated[Duration, Field(gt=0)] | None = None
+    when_full: Literal["drop-oldest", "refuse"] = "drop-oldest"
+
+
+class MappedTopicsSection(_Section):
+    """A filter, and what is in front of it here and at the fleet's broker.
+
+    `remote_prefix` defaults to the `prefix` of the link.
+    """
+
+    topic: Annotated[str, AfterValidator(check_relative_filter)]
+    local_prefix: Annotated[str, AfterValidator(check_topic_prefix)] = "{robot}/"
+    remote_prefix: Annotated[str, AfterValidator(check_topic_prefix)] | None = None
+
+    def local_filter(self, robot: str) -> str:
+        """The topic filter here."""
+        return self.local_prefix.replace("{robot}", robot) + self.topic
+
+    def remote_filter(self, robot: str, prefix: str) -> str:
+        """The topic filter at the fleet's broker; `prefix` is that of the link."""
+        return self.prefix_there(robot, prefix) + self.topic
+
+    def prefix_there(self, robot: str, prefix: str) -> str:
+        """What is in front of the topic at the fleet's broker."""
+        own = prefix if self.remote_prefix is None else self.remote_prefix
+        return own.replace("{robot}", robot)
+
+
+class OutSection(MappedTopicsSection):
+    """Topics that a link carries to the fleet's broker; `rate` in messages a second."""
+
+    keep: Literal["auto", "all", "latest", "none"] = "auto"
+    priority: Literal["high", "normal", "low"] = "normal"
+    rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+
+
+class InSection(MappedTopicsSection):
+    """Topics that a link carries from the fleet's broker; `late` in seconds, None for auto."""
+
+    late: Annotated[Duration, Field(gt=0)] | None = None
+    offline: Literal["drop", "keep"] = "drop"
+
+
+class UpstreamSection(_Section):
+    """A link to a fleet's broker; `rate` in messages a second, `keep_alive` in seconds."""
+
+    name: Annotated[str, AfterValidator(check_robot)]
+    servers: list[Server] = Field(min_length=1)
+    kind: Literal["generic", "aws-iot", "azure-event-grid", "rabbitmq"] = "generic"
+    version: ProtocolVersion = "5"
+    client_id: Annotated[str, AfterValidator(check_client_id)] = "{robot}"
+    user: Annotated[str, Field(min_length=1)] = "upstream"
+    prefix: Annotated[str, AfterValidator(check_fleet_prefix)] = "fleet/{robot}/"
+    login: UpstreamLoginSection = _section()
+    tls: UpstreamTlsSection = _section()
+    proxy: Annotated[Proxy | None, Field(repr=False)] = None
+    keep_alive: Annotated[Duration, Field(ge=1, le=65535)] = 30.0
+    window: Annotated[int, Field(ge=1, le=65535)] = 1000
+    rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    bytes_per_second: Annotated[Size, Field(gt=0)] | None = None
+    backlog: BacklogSection = _section()
+    out: list[OutSection] = []
+    inward: list[InSection] = Field(default=[], alias="in")  # `in` is a word of Python's
+
+
 class LogSection(_Section):
     """Level and format of the log; `levels` has levels of single loggers, such as appliance.ros."""
 
@@ -474,6 +569,7 @@ class Settings(_Section):
     robot: Annotated[str, AfterValidator(check_robot)] = "robot"
     broker: BrokerSection = _section()
     bridge: BridgeSection = _section()
+    upstreams: list[UpstreamSection] = []
     log: LogSection = _section()
     control: FilePath = Path("state/control.sock")
     reload_on_change: bool = True

@@ -18,6 +18,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from appliance.mqtt.topics import holds_control
+
 
 def _parse_qos(value: object) -> int | None:
     if value is None or value == "auto":
@@ -55,6 +57,49 @@ def check_robot(value: str) -> str:
             "must be one level of an MQTT topic: a letter or digit, "
             "then up to 63 letters, digits, '_', '-' or '.'"
         )
+    return value
+
+
+def _check_robot_only(value: str) -> str:
+    plain = value.replace("{robot}", "r")
+    if "{" in plain or "}" in plain:
+        raise ValueError("knows the placeholder {robot} only")
+    if holds_control(plain) or "\0" in plain:
+        raise ValueError("must not have control characters in it")
+    return plain
+
+
+def check_client_id(value: str) -> str:
+    if not _check_robot_only(value):
+        raise ValueError("must not be empty")
+    return value
+
+
+def check_login_name(value: str) -> str:
+    _check_robot_only(value)
+    return value
+
+
+def check_topic_prefix(value: str) -> str:
+    """The beginning of topics, which may be empty, and may end within a level."""
+    plain = _check_robot_only(value)
+    if "+" in plain or "#" in plain:
+        raise ValueError("must be the beginning of MQTT topics, without '+' and '#'")
+    return value
+
+
+def check_fleet_prefix(value: str) -> str:
+    """The beginning of all topics of a link, of whole levels."""
+    check_topic_prefix(value)
+    if not value.endswith("/") or value == "/":
+        raise ValueError("must be the beginning of MQTT topics that ends with '/'")
+    return value
+
+
+def check_relative_filter(value: str) -> str:
+    """A topic filter without its beginning; it is empty where the prefixes are whole topics."""
+    if "{" in value or "}" in value:
+        raise ValueError("knows no placeholders: it is what follows local_prefix, {robot}/")
     return value
 
 
@@ -260,6 +305,10 @@ def _unquoted_off(value: object) -> object:
     return "off" if value is False else value  # off is a boolean in YAML 1.1
 
 
+def _unquoted_protocol(value: object) -> object:
+    return "5" if value in (5, "5.0") and not isinstance(value, bool) else value
+
+
 def _unquoted_version(value: object) -> object:
     return str(value) if isinstance(value, float) else value
 
@@ -282,6 +331,9 @@ Keep = Annotated[int | Literal["latest"], PlainValidator(_parse_keep)]
 ClientCertificates = Annotated[
     Literal["off", "optional", "required"], BeforeValidator(_unquoted_off)
 ]
+
+
+ProtocolVersion = Annotated[Literal["5", "3.1.1"], BeforeValidator(_unquoted_protocol)]
 
 
 TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]

@@ -27,7 +27,7 @@ from typing import Any
 import yaml
 
 from appliance.broker.faults import Faults
-from appliance.config import Settings, describe, secrets_in
+from appliance.config import Settings, describe, secrets_of
 from appliance.config.redaction import redacted
 from appliance.ops import logs
 
@@ -64,7 +64,7 @@ class CrashReports:
         self._settings = settings
         self._running: int | None = None
         self._reported = self._faults = 0
-        secrets = secrets_in(settings.broker.plugins)
+        secrets = secrets_of(settings)
         self._secrets = [secret for secret in secrets if len(secret) >= SHORTEST_SECRET]
 
     def start(self) -> None:

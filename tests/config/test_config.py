@@ -77,11 +77,14 @@ def test_the_reference_has_every_key_with_its_default() -> None:
             assert " # " in line or "tls: " in line, f"says no why: {line}"
 
 
+def example_of_the_reference() -> str:
+    """The reference with the examples in its comments in place of empty lists."""
+    lists = r"(?m)^(  topics|  services|  actions|  parameters|upstreams): \[\].*"
+    return re.sub(r"(?m)^  #  ", "    ", re.sub(lists, r"\1:", REFERENCE.read_text()))
+
+
 def test_the_example_routes_of_the_reference_load() -> None:
-    text = re.sub(
-        r"(?m)^  (topics|services|actions|parameters): \[\].*", r"  \1:", REFERENCE.read_text()
-    )
-    example = re.sub(r"(?m)^  #  ", "    ", text)
+    example = example_of_the_reference()
     bridge = config.loads(example, HERE).bridge
     routes = bridge.topics
     assert [(route.ros, route.to) for route in routes] == [

@@ -1,0 +1,101 @@
+"""The links of an appliance, from `upstreams` in appliance.yaml."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from appliance.config import Settings, UpstreamSection
+from appliance.config.settings import InSection
+from appliance.mqtt.codec import V5, V311
+from appliance.upstream.rules import (
+    BacklogLimits,
+    CommandTopics,
+    InRule,
+    OutRule,
+    UpstreamLogin,
+    UpstreamSettings,
+    UpstreamTls,
+    default_late,
+)
+
+
+def upstreams(settings: Settings) -> list[UpstreamSettings]:
+    """The links, in the order of the file."""
+    commands = list(command_topics(settings))
+    return [_upstream(section, settings.robot, commands) for section in settings.upstreams]
+
+
+def command_topics(settings: Settings) -> Iterator[CommandTopics]:
+    """The topics of routes to ROS, with the times after which commands are old."""
+    for route in settings.bridge.topics:
+        if route.is_exclusion or route.to == "mqtt" or settings.bridge.bus == "none":
+            continue
+        silence = None if route.on_silence is None else route.on_silence.after
+        topic = route.topic(settings.robot)
+        for name in route.names:
+            if not name.startswith("!"):
+                filter = _filter(topic.replace("{ros}", _ros_filter(name)))
+                yield CommandTopics(filter, route.expire, silence)
+
+
+def _ros_filter(name: str) -> str:
+    """A ROS name or pattern with MQTT's wildcards: `**` may be any number of parts."""
+    return name.replace("**", "#").replace("*", "+")
+
+
+def _filter(topic: str) -> str:
+    """A valid filter for a topic with wildcards anywhere, which matches at least as much."""
+    levels: list[str] = []
+    for level in topic.split("/"):
+        if "#" in level:
+            return "/".join([*levels, "#"])
+        levels.append("+" if "+" in level else level)
+    return "/".join(levels)
+
+
+def _upstream(
+    section: UpstreamSection, robot: str, commands: list[CommandTopics]
+) -> UpstreamSettings:
+    def named(text: str) -> str:
+        return text.replace("{robot}", robot)
+
+    login, tls = section.login, section.tls
+    username = None if login.username is None else named(login.username)
+    return section.build(
+        UpstreamSettings,
+        robot=robot,
+        servers=tuple(section.servers),
+        version=V5 if section.version == "5" else V311,
+        client_id=named(section.client_id),
+        prefix=named(section.prefix),
+        login=login.build(UpstreamLogin, username=username),
+        tls=tls.build(UpstreamTls, alpn=tuple(tls.alpn)),
+        keep_alive=math.ceil(section.keep_alive),
+        backlog=section.backlog.build(BacklogLimits),
+        out=tuple(
+            rule.build(
+                OutRule,
+                local_prefix=named(rule.local_prefix),
+                remote_prefix=rule.prefix_there(robot, section.prefix),
+            )
+            for rule in section.out
+        ),
+        inward=tuple(
+            rule.build(
+                InRule,
+                local_prefix=named(rule.local_prefix),
+                remote_prefix=rule.prefix_there(robot, section.prefix),
+                late=_late(rule, robot, commands),
+            )
+            for rule in section.inward
+        ),
+    )
+
+
+def _late(rule: InSection, robot: str, commands: list[CommandTopics]) -> float | None:
+    if rule.late is not None:
+        return rule.late
+    if rule.offline == "keep":  # what has been queued while the link was down is late on purpose
+        return None
+    return default_late(rule.local_filter(robot), commands)
