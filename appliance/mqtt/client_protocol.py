@@ -1,0 +1,198 @@
+"""The client side of one MQTT connection: which packets a server may send when, and how large.
+
+`ClientProtocol` takes received bytes and yields events, see `PacketFramer`. An `int` is an
+acknowledgement without properties here: ``reason code << 24 | type << 16 | packet id``, because
+some brokers answer each message that nobody subscribes to with No matching subscribers.
+"""
+
+from __future__ import annotations
+
+from appliance.mqtt.codec import V5, V311, PacketType, Property
+from appliance.mqtt.framing import (
+    DEFAULT_PAIRS,
+    MAXIMUM_CONNECT,
+    MAXIMUM_CONTROL,
+    PUBACK,
+    PUBCOMP,
+    PUBREC,
+    PUBREL,
+    UNAUTHENTICATED_PAIRS,
+    PacketFramer,
+    State,
+    check_type,
+)
+from appliance.mqtt.packets import (
+    Auth,
+    Connack,
+    Connect,
+    Disconnect,
+    Packet,
+    Puback,
+    Pubcomp,
+    Pubrec,
+    Pubrel,
+)
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+
+# The packets that a server may send in each state; any other is a protocol error (0x82).
+# DISCONNECT and AUTH exist in version 5 only, AUTH only after an authentication method. The
+# standard allows no DISCONNECT before CONNACK; what it says is more useful than an error.
+# [MQTT-3.2.0-1], [MQTT-3.2.0-2]
+_LEGAL: dict[State, frozenset[PacketType]] = {
+    State.NEW: frozenset(),
+    State.AUTHENTICATING: frozenset({PacketType.CONNACK, PacketType.AUTH, PacketType.DISCONNECT}),
+    State.CONNECTED: frozenset(
+        {
+            PacketType.PUBLISH,
+            PacketType.PUBACK,
+            PacketType.PUBREC,
+            PacketType.PUBREL,
+            PacketType.PUBCOMP,
+            PacketType.SUBACK,
+            PacketType.UNSUBACK,
+            PacketType.PINGRESP,
+            PacketType.DISCONNECT,
+            PacketType.AUTH,
+        }
+    ),
+    State.CLOSED: frozenset(),
+}
+
+# What the first byte is when the peer does not speak MQTT at all, and what the user can do.
+_STRANGERS = {
+    0x15: "what it sends is TLS; is it meant for mqtts: or wss:?",
+    0x16: "what it sends is TLS; is it meant for mqtts: or wss:?",
+    0x48: "what it sends is HTTP; is it meant for ws: or wss:?",  # the H of HTTP/1.1
+}
+
+# First byte of an acknowledgement -> its event without the packet id, and its reason codes.
+_ACKNOWLEDGEMENTS: dict[int, tuple[int, frozenset[ReasonCode]]] = {
+    0x40: (PUBACK, Puback.REASONS),
+    0x50: (PUBREC, Pubrec.REASONS),
+    0x62: (PUBREL, Pubrel.REASONS),
+    0x70: (PUBCOMP, Pubcomp.REASONS),
+}
+
+#: The largest acknowledgement without properties, in bytes: smaller than any packet size limit that
+#: is of use.
+_SHORT = 6
+
+
+class ClientProtocol(PacketFramer):
+    """The client side of one MQTT connection, without I/O, after `connect` was sent.
+
+    `maximum_packet_size` is the limit of a whole packet, in bytes; in version 5 `connect` announces
+    it. The limit of topic aliases is the one that `connect` announces. `user_properties` is the
+    limit of User Properties in a packet after CONNACK. These are not decoded here.
+    """
+
+    def __init__(
+        self, connect: Connect, maximum_packet_size: int, user_properties: int = DEFAULT_PAIRS
+    ) -> None:
+        announced = (connect.properties or {}) if connect.version == V5 else {}
+        aliases = announced.get(Property.TOPIC_ALIAS_MAXIMUM, 0)
+        assert isinstance(aliases, int)
+        super().__init__(
+            State.AUTHENTICATING,
+            maximum_packet_size,
+            aliases,
+            user_properties,
+            with_identifiers=True,
+        )
+        self.version = V5 if connect.version == V5 else V311
+        self._clean_start = connect.clean_start
+        self._is_named = bool(connect.client_id)
+        self._method = announced.get(Property.AUTHENTICATION_METHOD)
+        #: Whether the client has sent AUTH with Re-authenticate, and has no answer to it yet.
+        self.reauthenticating = False
+
+    def _check(self, first: int, size: int) -> None:
+        """Raise ProtocolError if a packet of this type or size is not allowed now."""
+        if first in _ACKNOWLEDGEMENTS and size <= _SHORT and self.state is State.CONNECTED:
+            return
+        if self.state is State.AUTHENTICATING and first in _STRANGERS:
+            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, _STRANGERS[first])
+        check_type(first)
+        kind = PacketType(first >> 4)
+        if (
+            kind not in _LEGAL[self.state]
+            or (kind is PacketType.DISCONNECT and self.version != V5)
+            or (kind is PacketType.AUTH and self._method is None)  # [MQTT-4.12.0-6]
+        ):
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR, f"a {kind.name} may not come {self.state.value}"
+            )
+        if size > self.maximum_packet_size:  # [MQTT-3.1.2-24]
+            raise ProtocolError(
+                ReasonCode.PACKET_TOO_LARGE,
+                f"a packet of {size} bytes, more than the limit of {self.maximum_packet_size}",
+            )
+        is_new = self.state is State.AUTHENTICATING
+        self._check_size(kind, size, MAXIMUM_CONNECT if is_new else MAXIMUM_CONTROL)
+
+    def _decode(self, first: int, body: bytes) -> Packet | int:
+        size = len(body)
+        if first in _ACKNOWLEDGEMENTS and self.version == V5:
+            kind, codes = _ACKNOWLEDGEMENTS[first]
+            if (size == 3 or (size == 4 and not body[3])) and body[2] in codes:
+                packet_id = body[0] << 8 | body[1]
+                if packet_id:
+                    return body[2] << 24 | kind | packet_id
+        if first >> 4 == PacketType.PUBLISH:
+            return self._publish(first, body)
+        if first == 0x20 and size == 2 and 1 <= body[1] <= 5 and self.version == V5:
+            # A server of 3.1.1 refuses version 5 in its own version: 3.1.1 [MQTT-3.1.2-2].
+            self.close()
+            return Connack.decode(0, body, V311)
+        is_new = self.state is State.AUTHENTICATING
+        packet = self._decode_packet(
+            first, body, UNAUTHENTICATED_PAIRS if is_new else self.user_properties
+        )
+        if isinstance(packet, Connack):
+            self._on_connack(packet)
+        elif isinstance(packet, Auth):
+            self._on_auth(packet)
+        elif isinstance(packet, Disconnect):
+            self.close()  # [MQTT-3.14.4-1]: it sends nothing after it
+        return packet
+
+    def _on_connack(self, connack: Connack) -> None:
+        if connack.reason_code:
+            self.close()  # [MQTT-3.2.2-7]: the server closes the connection
+            return
+        if connack.session_present and self._clean_start:  # [MQTT-3.2.2-1] v5 [MQTT-3.2.2-4]
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR, "CONNACK with a session after a clean start"
+            )
+        properties = connack.properties or {}
+        if self.version == V5:
+            self._check_method("CONNACK", properties.get(Property.AUTHENTICATION_METHOD))
+            if not self._is_named and Property.ASSIGNED_CLIENT_IDENTIFIER not in properties:
+                raise ProtocolError(  # [MQTT-3.2.2-16]
+                    ReasonCode.PROTOCOL_ERROR, "CONNACK without the client identifier it assigns"
+                )
+        self.state = State.CONNECTED
+
+    def _on_auth(self, auth: Auth) -> None:
+        properties = auth.properties or {}
+        self._check_method("AUTH", properties.get(Property.AUTHENTICATION_METHOD))
+        if self.state is State.AUTHENTICATING:
+            expected = auth.reason_code == ReasonCode.CONTINUE_AUTHENTICATION  # [MQTT-4.12.0-2]
+        else:
+            # 5.0 section 4.12.1: only the client begins to authenticate again.
+            expected = self.reauthenticating and auth.reason_code != ReasonCode.RE_AUTHENTICATE
+        if not expected:
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR,
+                f"an AUTH with 0x{auth.reason_code:02x} may not come {self.state.value}",
+            )
+        if auth.reason_code == ReasonCode.SUCCESS:
+            self.reauthenticating = False
+
+    def _check_method(self, packet: str, method: object) -> None:
+        """Raise ProtocolError if it is not the authentication method of CONNECT."""
+        if method != self._method:  # [MQTT-4.12.0-5] [MQTT-4.12.0-6]
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR,
+                f"{packet} with another authentication method than CONNECT",
+            )
