@@ -247,6 +247,10 @@ class Acl:
         verdict = self._verdict(identity, action, topic, rules)
         return Decision(verdict.allowed, verdict.reason)
 
+    def allows_some(self, identity: Identity, action: Action, filter: str) -> bool:
+        """Whether the client may do this with some topic that matches the valid filter."""
+        return self._some(identity, action, filter, list(self._applied(identity, filter))).allowed
+
     def explain(self, identity: Identity, topic: str) -> Explanation:
         """Why the client may or may not read, write and subscribe; for a filter only subscribe.
 
@@ -266,7 +270,7 @@ class Acl:
         self, identity: Identity, action: Action, topic: str, rules: Iterable[_Applied]
     ) -> ActionVerdict:
         if action is Action.SUBSCRIBE:
-            return self._subscribe(identity, topic, list(rules))
+            return self._some(identity, action, topic, list(rules))
         needed = _NEEDED[action]
         passed: list[tuple[Rule, str]] = []
         for applied in rules:
@@ -281,10 +285,11 @@ class Acl:
             action, False, None, self._no_rule(identity, action, topic), tuple(passed)
         )
 
-    def _subscribe(
-        self, identity: Identity, filter: str, rules: Sequence[_Applied]
+    def _some(
+        self, identity: Identity, action: Action, filter: str, rules: Sequence[_Applied]
     ) -> ActionVerdict:
-        action = Action.SUBSCRIBE
+        """The decision about all topics that match the filter: the one that allows something."""
+        needed = _NEEDED[action]
         shared = parse_shared(filter)
         wanted = shared[1] if shared is not None else filter
         denying = [deny for deny in rules if deny.rule.denies and deny.overlaps(wanted)]
@@ -295,7 +300,7 @@ class Acl:
             rule = applied.rule
             if rule.denies:
                 continue
-            if not rule.gives(Permission.READ):
+            if not rule.gives(needed):
                 passed.append((rule, _ONLY[rule.permission]))
             elif applied.filter is None:
                 passed.append((rule, _UNFIT))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from appliance.config import Settings, UpstreamSection
+from appliance.config import Settings, TopicRoute, UpstreamSection
 from appliance.config.settings import InSection
 from appliance.mqtt.codec import V5, V311
 from appliance.upstream.rules import (
@@ -28,15 +28,21 @@ def upstreams(settings: Settings) -> list[UpstreamSettings]:
 
 def command_topics(settings: Settings) -> Iterator[CommandTopics]:
     """The topics of routes to ROS, with the times after which commands are old."""
+    if settings.bridge.bus == "none":
+        return
     for route in settings.bridge.topics:
-        if route.is_exclusion or route.to == "mqtt" or settings.bridge.bus == "none":
+        if route.is_exclusion or route.to == "mqtt":
             continue
         silence = None if route.on_silence is None else route.on_silence.after
-        topic = route.topic(settings.robot)
-        for name in route.names:
-            if not name.startswith("!"):
-                filter = _filter(topic.replace("{ros}", _ros_filter(name)))
-                yield CommandTopics(filter, route.expire, silence)
+        for filter in command_filters(route, settings.robot):
+            yield CommandTopics(filter, route.expire, silence)
+
+
+def command_filters(route: TopicRoute, robot: str) -> list[str]:
+    """Filters of the topics that the route takes; what it leaves out is among them."""
+    topic = route.topic(robot)
+    names = [name for name in route.names if not name.startswith("!")]
+    return [_filter(topic.replace("{ros}", _ros_filter(name))) for name in names]
 
 
 def _ros_filter(name: str) -> str:

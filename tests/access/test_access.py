@@ -471,7 +471,8 @@ def filters(draw: st.DrawFn) -> str:
 
 
 def rules(pattern: bool) -> st.SearchStrategy[Rule]:
-    permissions = st.sampled_from([Permission.DENY, Permission.DENY, Permission.READ])
+    deny, read, write = Permission.DENY, Permission.READ, Permission.WRITE
+    permissions = st.sampled_from([deny, deny, deny, read, read, write])
     return st.builds(
         lambda permission, filter: Rule("f", 1, filter, permission, filter, None, pattern),
         permissions,
@@ -488,9 +489,13 @@ def test_a_subscription_is_allowed_exactly_when_some_topic_could_be_delivered(
     # Rules have four levels at most and `z` is in none, so these topics stand for all topics;
     # five levels are wanted for filters with `#` that are denied up to four.
     topics = [*TOPICS, *(f"{topic}/z" for topic in TOPICS if topic.count("/") == 3)]
-    wanted = (topic for topic in topics if matches(filter, topic))
-    possible = any(acl.decide(NOBODY, Action.RECEIVE, topic) for topic in wanted)
-    assert bool(acl.decide(NOBODY, Action.SUBSCRIBE, filter)) is possible
+    wanted = [topic for topic in topics if matches(filter, topic)]
+    possible = {
+        action: any(acl.decide(NOBODY, action, topic) for topic in wanted)
+        for action in (Action.RECEIVE, Action.PUBLISH)
+    }
+    assert bool(acl.decide(NOBODY, Action.SUBSCRIBE, filter)) is possible[Action.RECEIVE]
+    assert {each: acl.allows_some(NOBODY, each, filter) for each in possible} == possible
 
 
 NAMES = ["a", "b", "c", "$SYS", ""]

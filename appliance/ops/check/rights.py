@@ -52,7 +52,7 @@ def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Setting
     may = [name for name in users if acl.decide(Identity(name, name), Action.PUBLISH, topic)]
     others = [name for name in users if name not in may]
     subject = f"{ros} ← {topic}"
-    line = f"topic {Permission.WRITE.name.lower()} {_written(topic, settings.robot)}"
+    line = f"topic {Permission.WRITE.name.lower()} {written(topic, settings.robot)}"
     who = _named(may) if may else "no user"
     text = f"{who} may send to it"
     if others:
@@ -63,7 +63,7 @@ def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Setting
     return Finding("ok" if may else "warning", subject, text)
 
 
-def _written(topic: str, robot: str) -> str:
+def written(topic: str, robot: str) -> str:
     """The topic as a line of the rules has it, with `{robot}` for the robot's name."""
     return "{robot}" + topic.removeprefix(robot) if topic.startswith(f"{robot}/") else topic
 

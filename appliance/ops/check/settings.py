@@ -18,6 +18,7 @@ from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
 from appliance.ops.check.bridge import bridge
 from appliance.ops.check.plugins import plugin_settings
 from appliance.ops.check.rights import rights
+from appliance.ops.check.upstreams import upstreams
 from appliance.ops.finding import Finding
 from appliance.store import StoreError
 from appliance.store.inspection import summarise
@@ -26,7 +27,7 @@ from appliance.store.inspection import summarise
 def check(settings: Settings) -> Iterator[Finding]:
     """Findings about everything that the settings refer to, including those that are ok."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _store, _audit, _plugins, bridge]
+    parts = [_listeners, _access, _store, _audit, _plugins, bridge, upstreams]
     if any(listener.tls for listener in settings.broker.listeners):
         parts.insert(2, _certificates)
     for part in parts:
@@ -102,7 +103,8 @@ def _access(settings: Settings) -> Iterator[Finding]:
         yield from rights(settings, rules, users)
     others = broker.plugins or broker.tls.username_from != "none"  # these may know more users
     if rules is not None and users is not None and not others:
-        strangers = {rule.user: rule for rule in reversed(rules.rules) if rule.user not in users}
+        known = {*users, *(upstream.user for upstream in settings.upstreams)}
+        strangers = {rule.user: rule for rule in reversed(rules.rules) if rule.user not in known}
         for name, first in strangers.items():
             if name:
                 text = (
