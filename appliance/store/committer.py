@@ -53,8 +53,10 @@ class Committer:
         #: Whether nothing can be written now.
         self.failing = False
         self.metrics = CommitMetrics()
+        self.path = path
+        #: Called after each commit, with the number of the last batch that is committed.
+        self.after_commit: Callable[[int], None] = lambda number: None
         self._state = state
-        self._path = path
         self._writer = Writer(path, durability, self._written)
         self._entries: Entries
         self._failed: Batch | None = None
@@ -159,6 +161,7 @@ class Committer:
             self._timer.cancel()
             self._timer = None
         batch = self.open
+        batch.seal()
         if self._failed is not None:
             self._failed.absorb(batch)
             batch, self._failed = self._failed, None
@@ -197,7 +200,7 @@ class Committer:
             self.metrics.messages += batch.messages
             self.metrics.largest = max(self.metrics.largest, batch.messages)
             if self.failing:
-                log.warning("%s can be written again; all that was waiting is kept", self._path)
+                log.warning("%s can be written again; all that was waiting is kept", self.path)
             self.failing = False
             self._state.staged = self.open.has_dependents
         else:
@@ -210,12 +213,14 @@ class Committer:
         if outcome is not None:
             outcome.set_result(None)
         self._entries.faults.run("store.committed", self._notify, error is None, otherwise=None)
+        if error is None:
+            self.after_commit(batch.number)
 
     def _log_failure(self, problem: str) -> None:
         log.error(
             "%s CANNOT BE WRITTEN: %s. QoS 1 and 2 messages for sessions that are stored, and "
             "retained ones, are refused until it can; that is tried every %g s",
-            self._path,
+            self.path,
             problem,
             RETRY,
         )

@@ -15,18 +15,22 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from appliance.store.rows import Rows, Table
-from appliance.store.schema import DamagedError, Durability, StoreError, connect, read_table
+from appliance.store.rows import LOADED, Rows
+from appliance.store.schema import (
+    DamagedError,
+    Durability,
+    StoreError,
+    connect,
+    is_damage,
+    is_lost,
+    read_table,
+)
 
 log = logging.getLogger("appliance.store")
 
 #: The suffixes of SQLite's files beside a database: the write-ahead log, and the index to it, which
 #: SQLite rebuilds.
 _LOG, _INDEX = "-wal", "-shm"
-
-#: Parts of SQLite's messages that say that the file is damaged. The others are about its
-#: surroundings: the disk is full or read-only, the file is locked.
-_DAMAGE = ("malformed", "not a database", "no such table", "no such column", "corrupt")
 
 
 @dataclass(slots=True)
@@ -144,17 +148,13 @@ def read(path: Path, durability: Durability) -> Contents:
     except DamagedError as error:
         return _set_aside(path, str(error))
     except (sqlite3.Error, OSError) as error:
-        if _is_damage(error):
+        if is_damage(error):
             return _set_aside(path, str(error))
         if "locked" in str(error):
             raise StoreError(
                 f"{path} is locked by another program: end that, or move the file away"
             ) from None
         return _read_copy(path, error)
-
-
-def _is_damage(error: Exception) -> bool:
-    return any(word in str(error) for word in _DAMAGE) or isinstance(error, UnicodeError)
 
 
 def _read(path: Path, durability: Durability) -> Contents:
@@ -167,13 +167,30 @@ def _read(path: Path, durability: Durability) -> Contents:
 
 
 def _read_all(connection: sqlite3.Connection) -> Rows:
-    (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    for name in ("sqlite_master", *(table.name.lower() for table in LOADED)):
+        _check(connection, f"('{name}')")
+    # Of the backlog only where the next records go: there may be a gigabyte of it, and records
+    # have a checksum.
+    connection.execute("SELECT max(id) FROM backlog").fetchone()
+    rows = Rows()
+    for table in LOADED:
+        rows.of(table).update(read_table(connection, table))
+    if any(row.length == 0 for row in rows.segment.values()):
+        log.warning("some records of a backlog were damaged: the whole file is being checked")
+        _check(connection, "(1)")
+    return rows
+
+
+def _check(connection: sqlite3.Connection, argument: str) -> None:
+    """Check a table, or the whole file. Raises DamagedError, sqlite3.Error."""
+    try:
+        (verdict,) = connection.execute(f"PRAGMA quick_check{argument}").fetchone()
+    except sqlite3.OperationalError as error:
+        if is_lost(error):
+            raise DamagedError(str(error)) from None
+        raise
     if verdict != "ok":
         raise DamagedError(verdict.replace("\n", " "))
-    rows = Rows()
-    for table in Table:
-        rows.of(table).update(read_table(connection, table))
-    return rows
 
 
 def _read_copy(path: Path, error: Exception) -> Contents:
@@ -237,7 +254,7 @@ def _set_aside(path: Path, damage: str) -> Contents:
             f"{path} is damaged ({damage}) and cannot be set aside: {error.strerror}"
         ) from None
     rows = salvage(aside)
-    found = ", ".join(f"{len(rows.of(table))} {table.name.lower()}" for table in Table)
+    found = ", ".join(f"{len(rows.of(table))} {table.name.lower()}" for table in LOADED)
     log.error(
         "%s IS DAMAGED (%s). It was set aside as %s; what could be read of it is kept (%s), what "
         "could not is lost",
@@ -260,7 +277,7 @@ def salvage(path: Path) -> Rows:
                 if with_log and _beside(path, _LOG).exists():
                     shutil.copyfile(_beside(path, _LOG), _beside(copy, _LOG))
             rows = _salvage(copy)
-            if any(map(rows.of, Table)):
+            if any(map(rows.of, LOADED)):
                 break  # reading it without its log as well would mix in an older state
     return rows
 
@@ -274,7 +291,7 @@ def _salvage(path: Path) -> Rows:
     with contextlib.closing(connection):
         with contextlib.suppress(sqlite3.Error):  # so that damaged cells are not taken for rows
             connection.execute("PRAGMA cell_size_check = ON")
-        for table in Table:
+        for table in LOADED:
             # From both ends, up to the damage.
             for order in ("ASC", "DESC"):
                 with contextlib.suppress(sqlite3.Error, UnicodeError, OverflowError, DamagedError):

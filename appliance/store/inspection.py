@@ -23,6 +23,7 @@ from appliance.store.schema import (
     connect,
     connect_to_read,
     read_table,
+    tables_of,
     version,
 )
 from appliance.store.writer import Batch, write
@@ -71,7 +72,7 @@ def read(path: Path) -> Rows:
     try:
         with contextlib.closing(connect_to_read(path)) as connection:
             # The database of an older appliance has fewer tables until this one runs.
-            tables = [*Table] if version(connection) > 1 else [*Table][: Table.CLOCK]
+            tables = tables_of(version(connection))
             connection.execute("BEGIN")
             rows = Rows()
             for table in tables:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Store
+from appliance.broker.ports import Backlogs, Store
 
 
 class SessionStore(Store, Protocol):
@@ -23,6 +23,10 @@ class SessionStore(Store, Protocol):
     @property
     def failing(self) -> bool:
         """Whether nothing can be stored now."""
+
+    @property
+    def backlogs(self) -> Backlogs:
+        """The backlogs of links to other brokers, from `restore` on."""
 
     def open(self) -> None:
         """Lock and read what the last run has stored.

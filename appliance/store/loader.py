@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar, cast
 
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity
+from appliance.broker.ports import Identity, Segment
 from appliance.broker.saved_sessions import PendingDelivery, SavedSession
 from appliance.broker.session import PendingWill
 from appliance.mqtt.codec import (
@@ -29,11 +29,15 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError
 from appliance.mqtt.topics import check_filter, check_topic, parse_shared
 from appliance.store.rows import (
+    LOADED,
+    SET_ASIDE,
+    LatestRow,
     MessageRow,
     OwedRow,
     ReceivedRow,
     RetainedRow,
     Rows,
+    SegmentRow,
     SessionRow,
     SubscriptionRow,
     Table,
@@ -72,6 +76,14 @@ class OwnedMessage(NamedTuple):
 
 
 @dataclass(slots=True)
+class LoadedBacklogs:
+    """The segments of each link and lane, and the records of each link and kind, by their keys."""
+
+    segments: dict[tuple[str, int], list[Segment]] = field(default_factory=dict)
+    records: dict[tuple[str, int], dict[int, bytes]] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
 class Loaded:
     """All that the rows stand for; `useless` are rows to delete."""
 
@@ -80,6 +92,7 @@ class Loaded:
     #: The message expiry intervals of wills, by the keys of their messages.
     expiries: dict[int, int] = field(default_factory=dict)
     retained: dict[int, OwnedMessage] = field(default_factory=dict)
+    backlogs: LoadedBacklogs = field(default_factory=LoadedBacklogs)
     useless: list[tuple[Table, int]] = field(default_factory=list)
     last_key: int = 0
 
@@ -91,7 +104,7 @@ class _WrongRowError(Exception):
 def load(rows: Rows, offset: float) -> Loaded:
     """What the rows stand for, with times of the broker's clock; `offset` is as in `rows`."""
     loaded = Loaded()
-    keys = [key for table in Table for key in rows.of(table)]
+    keys = [key for table in LOADED for key in rows.of(table)]
     orders = [row.sent for row in rows.owed.values() if isinstance(row.sent, int)]
     loaded.last_key = max((key for key in (*keys, *orders) if 0 < key < LARGEST_KEY), default=0)
     wrong = 0
@@ -130,6 +143,16 @@ def load(rows: Rows, offset: float) -> Loaded:
     _sort_inflight(loaded, rows)
     each(Table.RECEIVED, rows.received, lambda row: _take_received(row, loaded))
     each(Table.RETAINED, rows.retained, lambda row: _take_retained(row, loaded))
+    damaged = [key for key, row in rows.segment.items() if row.length == 0]
+    for key in damaged:
+        del rows.segment[key]
+        loaded.useless.append((Table.SEGMENT, key))
+    each(Table.SEGMENT, rows.segment, lambda row: _take_segment(row, loaded.backlogs))
+    each(Table.LATEST, rows.latest, lambda row: _take_latest(row, loaded.backlogs))
+    # Segments' rows are useless without their records, and the other way round.
+    loaded.useless += [
+        (Table.BACKLOG, key) for table, key in loaded.useless if table is Table.SEGMENT
+    ]
     if wrong:
         log.warning("%d rows of the store mean nothing, and were left out", wrong)
     return loaded
@@ -297,3 +320,22 @@ def _take_retained(row: RetainedRow, loaded: Loaded) -> None:
         None if row.username is None else _of(str, row.username),
         _within(row.inside, 0, 1) == 1,
     )
+
+
+def _take_segment(row: SegmentRow, backlogs: LoadedBacklogs) -> None:
+    count = _within(row.length, 1, LARGEST_KEY)
+    moments = _time(row.first_at, 0.0), _time(row.last_at, 0.0)
+    segment = Segment(
+        row.id,
+        count,
+        _within(row.size, 0, LARGEST_KEY),
+        _within(row.done, 0, count),
+        *(_of(float, moment) for moment in moments),
+    )
+    place = _of(str, row.link), _within(row.lane, 0, LARGEST_KEY)
+    backlogs.segments.setdefault(place, []).append(segment)
+
+
+def _take_latest(row: LatestRow, backlogs: LoadedBacklogs) -> None:
+    place = _of(str, row.link), _within(row.kind, 0, SET_ASIDE)
+    backlogs.records.setdefault(place, {})[row.id] = _of(bytes, row.record)

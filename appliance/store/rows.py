@@ -45,6 +45,13 @@ class Table(IntEnum):
     RECEIVED = 4
     RETAINED = 5
     CLOCK = 6
+    SEGMENT = 7
+    BACKLOG = 8
+    LATEST = 9
+
+
+#: The tables that are read at the start: all except the records of backlogs, which may be many.
+LOADED: tuple[Table, ...] = tuple(table for table in Table if table is not Table.BACKLOG)
 
 
 class MessageRow(NamedTuple):
@@ -131,6 +138,49 @@ class ClockRow(NamedTuple):
     boot: Value
 
 
+class SegmentRow(NamedTuple):
+    """A segment of a link's journal: what is known of its records without reading them.
+
+    One with a length of 0 was damaged: nothing refers to its records, which are deleted when the
+    whole database has been checked.
+    """
+
+    id: int
+    link: Value
+    lane: Value
+    length: Value
+    size: Value
+    done: Value
+    first_at: Value
+    last_at: Value
+
+
+class BacklogRow(NamedTuple):
+    """The records of a segment, and what is needed to restore the segment's row."""
+
+    id: int
+    link: Value
+    lane: Value
+    length: Value
+    first_at: Value
+    last_at: Value
+    checksum: Value
+    records: Value
+
+
+#: The kinds of rows in the table `latest`: the latest record of its topic, and one set aside.
+LATEST, SET_ASIDE = 0, 1
+
+
+class LatestRow(NamedTuple):
+    """A record of a link that a newer one may replace; `kind` is LATEST or SET_ASIDE."""
+
+    id: int
+    link: Value
+    kind: Value
+    record: Value
+
+
 #: The named tuple of each table. A column that an older version of the tables does not have is at
 #: the end and has a default.
 ROW_TYPES: dict[Table, type[NamedTuple]] = {
@@ -141,6 +191,9 @@ ROW_TYPES: dict[Table, type[NamedTuple]] = {
     Table.RECEIVED: ReceivedRow,
     Table.RETAINED: RetainedRow,
     Table.CLOCK: ClockRow,
+    Table.SEGMENT: SegmentRow,
+    Table.BACKLOG: BacklogRow,
+    Table.LATEST: LatestRow,
 }
 
 COLUMNS: dict[Table, tuple[str, ...]] = {table: ROW_TYPES[table]._fields for table in Table}
@@ -148,7 +201,7 @@ COLUMNS: dict[Table, tuple[str, ...]] = {table: ROW_TYPES[table]._fields for tab
 
 @dataclass(slots=True)
 class Rows:
-    """All rows of a database by their keys; the fields are named as the tables."""
+    """All rows of the tables in `LOADED` by their keys; the fields are named as the tables."""
 
     message: dict[int, MessageRow] = field(default_factory=dict)
     session: dict[int, SessionRow] = field(default_factory=dict)
@@ -157,6 +210,8 @@ class Rows:
     received: dict[int, ReceivedRow] = field(default_factory=dict)
     retained: dict[int, RetainedRow] = field(default_factory=dict)
     clock: dict[int, ClockRow] = field(default_factory=dict)
+    segment: dict[int, SegmentRow] = field(default_factory=dict)
+    latest: dict[int, LatestRow] = field(default_factory=dict)
 
     def of(self, table: Table) -> dict[int, Row]:
         """The rows of one table."""

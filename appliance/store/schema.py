@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from appliance.store.rows import COLUMNS, ROW_TYPES, Row, Table
+from appliance.store.rows import COLUMNS, LOADED, ROW_TYPES, Row, Table
 
 Durability: TypeAlias = Literal["power", "process", "off"]
 
@@ -25,6 +25,21 @@ class StoreError(Exception):
 
 class DamagedError(Exception):
     """The database does not contain what was written to it."""
+
+
+#: Parts of SQLite's messages that say that the file is damaged. The others are about its
+#: surroundings: the disk is full or read-only, the file is locked.
+_DAMAGE = ("malformed", "not a database", "no such table", "no such column", "corrupt")
+
+
+def is_damage(error: Exception) -> bool:
+    """Whether the error says that the database does not contain what was written to it."""
+    return any(word in str(error) for word in _DAMAGE) or isinstance(error, UnicodeError)
+
+
+def is_lost(error: Exception) -> bool:
+    """Whether rows cannot be read: they were damaged, or the disk cannot read where they are."""
+    return is_damage(error) or "disk I/O error" in str(error)
 
 
 #: The script that makes each version out of the one before it.
@@ -104,6 +119,34 @@ MIGRATIONS: tuple[str, ...] = (
     ALTER TABLE retained ADD COLUMN username TEXT;
     -- 1: the appliance itself has
     ALTER TABLE retained ADD COLUMN inside INTEGER NOT NULL DEFAULT 0;
+    """,
+    """
+    CREATE TABLE segment (        -- of the journal of a link to another broker
+        id INTEGER PRIMARY KEY,   -- in the order of the records
+        link TEXT NOT NULL,
+        lane INTEGER NOT NULL,
+        length INTEGER NOT NULL,  -- records; 0: they were damaged
+        size INTEGER NOT NULL,    -- bytes of the records
+        done INTEGER NOT NULL,    -- records at the beginning that need not be sent
+        first_at REAL NOT NULL,
+        last_at REAL NOT NULL
+    );
+    CREATE TABLE backlog (        -- a segment's records, apart: segments are read without them
+        id INTEGER PRIMARY KEY,   -- of the segment
+        link TEXT NOT NULL,
+        lane INTEGER NOT NULL,
+        length INTEGER NOT NULL,
+        first_at REAL NOT NULL,
+        last_at REAL NOT NULL,
+        checksum INTEGER NOT NULL,  -- CRC-32 of:
+        records BLOB NOT NULL     -- their lengths, 4 bytes each, the lowest first; the records
+    );
+    CREATE TABLE latest (
+        id INTEGER PRIMARY KEY,
+        link TEXT NOT NULL,
+        kind INTEGER NOT NULL,    -- 0: the latest of its topic; 1: it was set aside
+        record BLOB NOT NULL
+    );
     """,
 )
 
@@ -199,6 +242,12 @@ def version(connection: sqlite3.Connection) -> int:
     if about != [(number,)] or owner != APPLICATION_ID:
         raise DamagedError("its version is not readable")
     return int(number)
+
+
+def tables_of(found: int) -> list[Table]:
+    """The tables of that version which are read at the start."""
+    first = {Table.CLOCK: 2, Table.SEGMENT: 5, Table.LATEST: 5}
+    return [table for table in LOADED if found >= first.get(table, 1)]
 
 
 def roll_back(connection: sqlite3.Connection) -> None:

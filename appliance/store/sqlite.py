@@ -17,7 +17,7 @@ from appliance.store.clock import KEY, StoreClock, boot_id, stamp_of
 from appliance.store.committer import CommitMetrics
 from appliance.store.database import Contents, Database
 from appliance.store.loader import Loaded, load
-from appliance.store.rows import Rows, Table
+from appliance.store.rows import LOADED, Rows, Table
 from appliance.store.schema import Durability
 from appliance.store.staging import StagingStore, StoredSession
 
@@ -97,6 +97,7 @@ class SqliteStore(StagingStore):
             batch.deleted[table][key] = None
         self._messages.delete_unreferenced()
         entries = Entries(loop, broker.faults)
+        self.backlogs.restore(loaded.backlogs, entries)
         self._committer.start(entries, contents.connection, contents.problem)
         if contents.salvaged and not contents.problem:
             self._committer.commit()
@@ -119,7 +120,7 @@ class SqliteStore(StagingStore):
         committer.start_keys(next_key)
         if contents.salvaged:
             committer.open.first_id = 1  # nothing is in the new database
-            for table in Table:
+            for table in LOADED:
                 committer.open.rows[table].update(contents.rows.of(table))
         self._put_stamp()
 
@@ -168,6 +169,7 @@ class SqliteStore(StagingStore):
         """See `SessionStore`."""
         if self._clock_check is not None:
             self._clock_check.cancel()
+        await self.backlogs.stop_reading()  # or the writer could not empty the write-ahead log
         await self._committer.stop(self._put_stamp)
         self._database.close()
 

@@ -10,6 +10,7 @@ from appliance.broker.message import Message
 from appliance.broker.ports import Identity
 from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.mqtt.packets import Subscription
+from appliance.store.backlogs import StoredBacklogs
 from appliance.store.clock import StoreClock
 from appliance.store.committer import Committer
 from appliance.store.messages import StoredMessages
@@ -55,6 +56,7 @@ class StagingStore(StoreState):
         self._clock = clock
         self._committer = Committer(self, path, durability)
         self._messages = StoredMessages(self, self._committer, clock)
+        self.backlogs = StoredBacklogs(self._committer, clock)
         self._sessions: dict[Session, StoredSession] = {}
         #: By topic: the key, the message and its owner.
         self._retained: dict[str, tuple[int, Message, Account]] = {}

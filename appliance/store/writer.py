@@ -10,8 +10,16 @@ from itertools import chain
 from pathlib import Path
 from typing import TypeAlias, TypeVar
 
+from appliance.store.records import UnwrittenSegment, damaged_row
 from appliance.store.rows import Row, Table
-from appliance.store.schema import Durability, connect, delete, insert, roll_back
+from appliance.store.schema import (
+    Durability,
+    connect,
+    delete,
+    insert,
+    is_lost,
+    roll_back,
+)
 
 #: Numbers of rows that one statement writes. Fewer statements are faster: each releases Python's
 #: global lock, and may wait to acquire it again for as long as the event loop is busy.
@@ -36,6 +44,8 @@ class Batch:
         "messages",
         "number",
         "rows",
+        "sealers",
+        "segments",
     )
 
     def __init__(self, number: int, first_id: int) -> None:
@@ -43,6 +53,10 @@ class Batch:
         self.first_id = first_id
         self.rows: list[dict[int, Row]] = [{} for _ in Table]
         self.deleted: list[dict[int, None]] = [{} for _ in Table]
+        #: Segments of backlogs whose records are to be written, by their keys.
+        self.segments: dict[int, UnwrittenSegment] = {}
+        #: Put the last rows into the batch, when it is handed over.
+        self.sealers: list[Callable[[Batch], None]] = []
         #: Messages that were staged, including those that were deleted again.
         self.messages = 0
         #: Something was staged, beside what the start itself has changed.
@@ -53,10 +67,10 @@ class Batch:
         self.is_awaited = False
 
     def __bool__(self) -> bool:
-        return any(self.rows) or any(self.deleted)
+        return any(self.rows) or any(self.deleted) or bool(self.sealers)
 
     def __len__(self) -> int:
-        return sum(map(len, self.rows)) + sum(map(len, self.deleted))
+        return sum(map(len, self.rows)) + sum(map(len, self.deleted)) + len(self.segments)
 
     def put(self, table: Table, key: int, row: Row) -> None:
         """Create the row, or replace it."""
@@ -68,12 +82,26 @@ class Batch:
         if key < self.first_id:
             self.deleted[table][key] = None
 
+    def remove_records(self, key: int) -> None:
+        """Delete the records of a segment."""
+        self.segments.pop(key, None)
+        self.remove(Table.BACKLOG, key)
+
+    def seal(self) -> None:
+        """Complete the batch before it is handed over; nothing is put into it afterwards."""
+        sealers, self.sealers = self.sealers, []
+        for seal in sealers:
+            seal(self)
+
     def absorb(self, newer: Batch) -> None:
         """Take over the changes of a later batch, because this one could not be written first."""
         for table in Table:
             for key in newer.deleted[table]:
                 self.remove(table, key)
             self.rows[table].update(newer.rows[table])
+        for key in newer.deleted[Table.BACKLOG]:
+            self.segments.pop(key, None)
+        self.segments.update(newer.segments)
         self.number = newer.number
         self.messages += newer.messages
 
@@ -122,7 +150,14 @@ class Writer:
     def _write(self, batch: Batch) -> None:
         if self._connection is None:
             self._connection = connect(self._path, self._durability)
-        write(self._connection, batch)
+        try:
+            write(self._connection, batch)
+        except sqlite3.Error as error:
+            if not batch.deleted[Table.BACKLOG] or not is_lost(error):
+                raise
+            roll_back(self._connection)
+            _spare_damaged(self._connection, batch)
+            write(self._connection, batch)
 
     def _close(self) -> None:
         connection, self._connection = self._connection, None
@@ -140,7 +175,25 @@ def write(connection: sqlite3.Connection, batch: Batch) -> None:
             connection.execute(delete(table, len(keys)), keys)
         for rows in _chunks(list(batch.rows[table].values())):
             connection.execute(insert(table, len(rows)), list(chain.from_iterable(rows)))
+    for segment in batch.segments.values():
+        connection.execute(insert(Table.BACKLOG, 1), segment.row())
     connection.execute("COMMIT")
+
+
+def _spare_damaged(connection: sqlite3.Connection, batch: Batch) -> None:
+    """Leave records there that cannot be read, because they cannot be deleted either.
+
+    Their segments are marked as damaged. Raises sqlite3.Error.
+    """
+    for key in list(batch.deleted[Table.BACKLOG]):
+        try:
+            connection.execute("SELECT records FROM backlog WHERE id = ?", (key,)).fetchall()
+        except sqlite3.Error as error:
+            if not is_lost(error):
+                raise
+            del batch.deleted[Table.BACKLOG][key]
+            batch.deleted[Table.SEGMENT].pop(key, None)
+            batch.put(Table.SEGMENT, key, damaged_row(key))
 
 
 def _chunks(items: list[_Item]) -> Iterator[list[_Item]]:

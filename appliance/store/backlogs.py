@@ -1,0 +1,125 @@
+"""The port `Backlogs` in the database: the journals and the latest records of all links."""
+
+from __future__ import annotations
+
+from appliance.net.callbacks import Entries
+from appliance.store.clock import StoreClock
+from appliance.store.committer import Committer
+from appliance.store.journal import StoredJournal
+from appliance.store.loader import LoadedBacklogs
+from appliance.store.reader import Reader
+from appliance.store.rows import LATEST, SET_ASIDE, Table
+
+
+class StoredLatestRecords:
+    """`LatestRecords` in the database; `records` are those that it has there."""
+
+    def __init__(
+        self, link: str, kind: int, records: dict[int, bytes], committer: Committer
+    ) -> None:
+        self._link = link
+        self._kind = kind
+        self._records = records
+        self._committer = committer
+
+    def load(self) -> list[tuple[int, bytes]]:
+        """See `LatestRecords`."""
+        return sorted(self._records.items())
+
+    def put(self, key: int | None, record: bytes, *, awaited: bool = True) -> int:
+        """See `LatestRecords`."""
+        committer = self._committer
+        if key is None:
+            key = next(committer.keys)
+        self._records[key] = record
+        committer.open.put(Table.LATEST, key, (key, self._link, self._kind, record))
+        if awaited:
+            committer.stage()
+        else:
+            committer.stage_lazily()
+        return key
+
+    def remove(self, key: int) -> None:
+        """See `LatestRecords`."""
+        if self._records.pop(key, None) is not None:
+            self._committer.open.remove(Table.LATEST, key)
+            self._committer.stage_lazily()
+
+
+class StoredBacklogs:
+    """`Backlogs` in the database of the committer."""
+
+    def __init__(self, committer: Committer, clock: StoreClock) -> None:
+        self._committer = committer
+        self._clock = clock
+        self._reader: Reader | None = None
+        self._loaded = LoadedBacklogs()
+        self._journals: dict[tuple[str, int], StoredJournal] = {}
+        self._latest: dict[tuple[str, int], StoredLatestRecords] = {}
+
+    def restore(self, loaded: LoadedBacklogs, entries: Entries) -> None:
+        """Take over what is in the database, before anything is committed."""
+        self._reader = Reader(self._committer.path, entries)
+        self._committer.after_commit = self._committed
+        self._loaded = loaded
+        for link, lane in loaded.segments:
+            self.journal(link, lane)
+        for link, kind in loaded.records:
+            self._records(link, kind)
+
+    async def stop_reading(self) -> None:
+        """Read nothing any more; may be called twice, and before `restore`."""
+        if self._reader is not None:
+            await self._reader.stop()
+
+    def _committed(self, number: int) -> None:
+        for journal in self._journals.values():
+            journal.committed(number)
+
+    @property
+    def failing(self) -> bool:
+        """See `Backlogs`."""
+        return self._committer.failing
+
+    def journal(self, link: str, lane: int) -> StoredJournal:
+        """See `Backlogs`."""
+        found = self._journals.get((link, lane))
+        if found is None:
+            assert self._reader is not None, "not before `restore`"
+            segments = self._loaded.segments.get((link, lane), [])
+            found = self._journals[link, lane] = StoredJournal(
+                link, lane, segments, self._committer, self._reader, self._clock
+            )
+        return found
+
+    def latest(self, link: str) -> StoredLatestRecords:
+        """See `Backlogs`."""
+        return self._records(link, LATEST)
+
+    def aside(self, link: str) -> StoredLatestRecords:
+        """See `Backlogs`."""
+        return self._records(link, SET_ASIDE)
+
+    def _records(self, link: str, kind: int) -> StoredLatestRecords:
+        found = self._latest.get((link, kind))
+        if found is None:
+            records = self._loaded.records.get((link, kind), {})
+            found = StoredLatestRecords(link, kind, records, self._committer)
+            self._latest[link, kind] = found
+        return found
+
+    def links(self) -> list[str]:
+        """See `Backlogs`."""
+        names = {link for (link, _), journal in self._journals.items() if journal.segments()}
+        names |= {link for (link, _), records in self._latest.items() if records.load()}
+        return sorted(names)
+
+    def forget(self, link: str) -> None:
+        """See `Backlogs`."""
+        for (name, _), journal in self._journals.items():
+            if name == link:
+                for segment in list(journal.segments()):
+                    journal.drop(segment)
+        for records in (self.latest(link), self.aside(link)):
+            for key, _ in records.load():
+                records.remove(key)
