@@ -33,6 +33,13 @@ def init(
             help="A further name that clients connect to, beside this computer's own. Repeatable.",
         ),
     ] = None,
+    upstream: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Add a link to the broker of a fleet: mqtts://HOST, or mqtts://USER@HOST.",
+        ),
+    ] = None,
 ) -> None:
     """Make certificates, a first user, access rules and appliance.yaml; existing files stay."""
     from appliance.access import AccessFileError
@@ -43,7 +50,10 @@ def init(
 
     try:
         with acting_for(directory / "appliance.yaml"):
-            for step in initialise(directory, robot=robot, user=user, demo=demo, names=name or []):
+            steps = initialise(
+                directory, robot=robot, user=user, demo=demo, names=name or [], upstream=upstream
+            )
+            for step in steps:
                 if isinstance(step, InitStep):
                     verb = "made" if step.made else "kept"
                     typer.echo(f"{verb}  {shown(step.path)}: {step.text}")

@@ -1,4 +1,7 @@
-"""`appliance init`: creates everything that a new appliance needs, and replaces no file."""
+"""`appliance init`: creates everything that a new appliance needs, and replaces no file.
+
+With a URL of a fleet's broker it adds a link to that, and the access rules that the link needs.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from appliance import certs, config
-from appliance.access import Passwords, check_username
+from appliance.access import Acl, Passwords, check_username
+from appliance.config import ConfigError
+from appliance.host.environment import of_service
+from appliance.ops.first_link import LINK_USER, FirstLink, parse_first_link
 
 PASSWORD_FILE = "user.password"
 _PASSWORD_LENGTH = 20  # of 62 characters each: 119 bits
@@ -122,11 +128,13 @@ def initialise(
     demo: bool = False,
     configuration: str = CONFIGURATION,
     names: Sequence[str] = (),
+    upstream: str | None = None,
 ) -> Iterator[InitStep | Credentials]:
     """Create what is missing in `directory`, and yield each step when it is done.
 
     `configuration` is the text for a missing appliance.yaml, with `{robot}` in it; `names` are DNS
-    names for the server's certificate, in addition to those that this computer knows.
+    names for the server's certificate, in addition to those that this computer knows. `upstream`
+    is the URL of a fleet's broker to add a link to.
 
     Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
     created until then is complete and stays.
@@ -135,6 +143,10 @@ def initialise(
         check_username(user)
     except ValueError as error:
         raise InitError(str(error)) from None
+    try:
+        first = None if upstream is None else parse_first_link(upstream)
+    except ValueError as error:
+        raise InitError(f"--upstream {error}") from None
     directory.mkdir(parents=True, exist_ok=True)
     file = directory / "appliance.yaml"
     name = robot_name(robot or ("demo" if demo else socket.gethostname().partition(".")[0]))
@@ -148,6 +160,8 @@ def initialise(
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     made = _write_new(settings.broker.acl, ACCESS.format(user=user, calls=calls or NO_CALLS))
     yield InitStep(settings.broker.acl, made, "access rules")
+    if first is not None:
+        yield from _link(settings, file, first)
     # The users come last, so that the password is the last thing shown.
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
 
@@ -225,6 +239,46 @@ def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Itera
     if made:
         certs.write_readme(directory)
     yield InitStep(readme, made, "what each of these files is, and who may have it")
+
+
+def _link(settings: config.Settings, file: Path, first: FirstLink) -> Iterator[InitStep]:
+    """Add the link to the configuration, and rules for its user where there are none."""
+    server = first.server
+    if settings.upstreams:
+        if not any(server in upstream.servers for upstream in settings.upstreams):
+            raise InitError(f"{file} has upstreams already; add {server} there:\n\n{first.section}")
+        yield InitStep(file, False, f"the link to {server}")
+        return
+    before = _ending_a_line(file)
+    try:
+        config.loads(before + first.section, file, {**of_service(file), **os.environ})
+    except ConfigError:  # it is written in another style, such as one line in braces
+        raise InitError(f"{file} cannot be continued; add to it:\n\n{first.section}") from None
+    rules = Acl.load(settings.broker.acl, settings.robot).rules
+    made = not any(rule.user == LINK_USER for rule in rules)
+    if made:  # before the link, which could carry nothing without them
+        _append(settings.broker.acl, first.rules)
+    yield InitStep(settings.broker.acl, made, f"access rules of the link's user, {LINK_USER}")
+    if first.password_file is not None:
+        made = _write_new(file.parent / first.password_file, "", mode=0o600)
+        text = f"put the password of {first.username} at {server.host} in its first line"
+        yield InitStep(file.parent / first.password_file, made, text)
+    _append(file, first.section)
+    yield InitStep(file, True, f"the link to {server}")
+
+
+def _ending_a_line(path: Path) -> str:
+    """The text of the file, with a line end behind its last line."""
+    text = path.read_text(encoding="utf-8")
+    return text if text.endswith("\n") or not text else f"{text}\n"
+
+
+def _append(path: Path, text: str) -> None:
+    """Write the text behind that of the file, in one go, and sync it."""
+    is_ended = _ending_a_line(path) == path.read_text(encoding="utf-8")
+    with path.open("ab", buffering=0) as file:
+        file.write(f"{'' if is_ended else chr(10)}{text}".encode())
+        os.fsync(file.fileno())
 
 
 def _users(

@@ -1,0 +1,93 @@
+"""The first link to a fleet's broker: its section of appliance.yaml, and its access rules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from urllib.parse import unquote
+
+from appliance.config import ServerUrl, UpstreamSection
+from appliance.config.urls import parse_server
+from appliance.upstream.limits import KINDS, kind_of_host
+
+LINK_NAME = "fleet"
+LINK_USER: str = UpstreamSection.model_fields["user"].default
+
+_SECTION = """
+# The link to the fleet's broker: {{robot}}/… here is fleet/{{robot}}/… there. See docs/upstream.md;
+# `appliance check` says what is missing.
+upstreams:
+  - name: {name}
+    servers: ["{server}"]
+{login}    out:
+      - {{topic: "events/#"}}              # {{robot}}/events/… here
+      - {{topic: _appliance/routes}}       # what is bridged
+    in: []
+    # What may come from there; for this, the access rules need: topic write {{robot}}/cmd_vel
+    #  in: [{{topic: cmd_vel, late: 500 ms}}]
+"""
+
+_RULES = """
+# The link to the fleet's broker. Nobody logs in as this user: `read` is what goes there, `write`
+# is what may come from there.
+user {user}
+topic read {{robot}}/events/#
+topic read {{robot}}/_appliance/routes
+# Answers to calls from there; which calls may come takes lines such as the last two:
+topic readwrite {{robot}}/_upstream/{name}/#
+#topic write {{robot}}/reset/_call/#
+#topic write {{robot}}/cmd_vel
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class FirstLink:
+    """A link to be added: the text of its section, and of the rules of its user.
+
+    `password_file` is relative to appliance.yaml; it is None without a `username`.
+    """
+
+    server: ServerUrl
+    section: str
+    rules: str
+    username: str | None = None
+    password_file: str | None = None
+
+
+def parse_first_link(url: str) -> FirstLink:
+    """The link to `mqtts://broker.example`, or, with a user, `mqtts://alice@broker.example`.
+
+    Raises:
+        ValueError: it is no such URL, or a password is in it.
+    """
+    scheme, slashes, rest = url.partition("://")
+    login, at, _ = rest.partition("/")[0].rpartition("@")
+    if ":" in login:
+        raise ValueError(
+            "must have no password: every user of this computer can read a command line; this "
+            "command makes a file for it"
+        )
+    server = parse_server(f"{scheme}{slashes}{rest[len(login) + len(at) :]}")
+    kind = kind_of_host(server.host) or "generic"
+    if KINDS[kind].needs_tls and not server.tls:
+        raise ValueError(f"must be mqtts:// or wss://: {server.host} takes nothing without TLS")
+    username = unquote(login) if login else None
+    password_file = None if username is None else f"{LINK_NAME}.password"
+    lines = [] if kind == "generic" else [f"kind: {kind}"]
+    if username is not None:
+        quoted = username.replace("'", "''")
+        lines.append(f"login: {{username: '{quoted}', password_file: {password_file}}}")
+    elif kind != "generic":
+        lines.append("tls: {certificate: fleet.crt, key: fleet.key}  # put them there")
+    elif server.tls:
+        lines.append(
+            "# tls: {ca: fleet-ca.crt}          # where this computer does not trust it yet"
+        )
+    return FirstLink(
+        server,
+        _SECTION.format(
+            name=LINK_NAME, server=server, login="".join(f"    {line}\n" for line in lines)
+        ),
+        _RULES.format(name=LINK_NAME, user=LINK_USER),
+        username,
+        password_file,
+    )
