@@ -1,0 +1,529 @@
+"""The local side of what a link receives: a session here that publishes what the fleet sends.
+
+It exists while a connection is up, with the rights of the link's user. When it ends, `departures`
+are told, so that a robot that the fleet drives stops. What comes is mapped to the topics here, and
+dropped if it goes in a circle, has expired or may be too old (`late`). The rest is published with
+the greatest age that it can have, by which routes to ROS judge it again.
+
+Messages are acknowledged on their connection only, in the order in which they came, after the
+commit that they depend on. A message whose receivers have no room waits, and with it all that comes
+behind it, as with a client here; acknowledgements of what the link sends do not wait. When too much
+waits, the connection is not read; what comes all the same is refused (0x97).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, Protocol
+
+from appliance.broker.backpressure import (
+    LEAST_COUNTED,
+    MESSAGE_PATIENCE,
+    PUBLISHER_PATIENCE,
+    Allowance,
+    Congestion,
+)
+from appliance.broker.broker import Broker
+from appliance.broker.client import PACKET_COST, RECHECK, RIGHTS_PATIENCE
+from appliance.broker.counters import COST_PER_TURN
+from appliance.broker.handshake import is_text
+from appliance.broker.message import OVERHEAD, DelayedMessage, Message
+from appliance.broker.output import CANNOT_KEEP
+from appliance.broker.ports import Identity, InsideLink, PeerStatus
+from appliance.broker.routing import Fanout
+from appliance.broker.session import Session
+from appliance.mqtt.codec import (
+    V5,
+    PacketType,
+    Property,
+    decode_properties,
+    encode_properties,
+    quote,
+    text_size,
+)
+from appliance.mqtt.packets import Publish
+from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.upstream.acknowledgements import Acknowledgements
+from appliance.upstream.answers import Answers, reply_topic
+from appliance.upstream.late import Freshness, Verdict, greatest_age, judge
+from appliance.upstream.loops import circle
+from appliance.upstream.rules import InRule, LinkRules, UpstreamSettings
+from appliance.upstream.sessions import in_client_id, kept_client_id
+
+#: The connection is not read while so many messages, or bytes of these, wait here. With twice as
+#: much, what was read of a chunk all the same is refused.
+WAITING_MESSAGES: Final = 1000
+WAITING_BYTES: Final = 4 << 20
+
+#: The cost of decoding the properties of a request to change its Response Topic.
+REQUEST_COST: Final = 5
+
+#: The reason codes that a client may put into PUBACK (5.0 section 3.4.2.1); 0x10 is a server's.
+_OF_CLIENTS: Final = frozenset((0x00, 0x80, 0x83, 0x87, 0x90, 0x91, 0x97, 0x99))
+
+
+class InConnection(Protocol):
+    """A connection to the fleet's broker, as the session needs it."""
+
+    #: The version of MQTT that is spoken on it.
+    version: int
+
+    def acknowledge(self, packet_id: int, code: int) -> None:
+        """Send a PUBACK; in MQTT 3.1.1, without the code."""
+
+    def later(self, seconds: float) -> None:
+        """Call `InSession.take_turn` in a later turn, after so many seconds at the latest.
+
+        An earlier time that was asked for stays.
+        """
+
+    def pause_reading(self) -> None:
+        """Read nothing until `resume_reading`."""
+
+    def resume_reading(self) -> None:
+        """Read on."""
+
+    def close(self, code: ReasonCode, reason: str) -> None:
+        """End the connection; `InSession.detach` is called before anything else is done."""
+
+    def peer_status(self) -> PeerStatus:
+        """The state of the connection to the fleet's broker."""
+
+    def probe(self) -> None:
+        """Make the broker answer within two seconds, if it can be reached."""
+
+
+@dataclass(slots=True)
+class InCounters:
+    """What came from the fleet since the start."""
+
+    received: int = 0
+    delivered: int = 0
+    #: Because of the access rules, a lack of room, or what a route to ROS said.
+    refused: int = 0
+    #: What had been here before, what no rule carries, and answers that nobody waits for.
+    circles: int = 0
+    uncarried: int = 0
+    unexpected_answers: int = 0
+    #: Dropped messages by the filter of their rule, there, and why.
+    dropped: Counter[tuple[str, Verdict]] = field(default_factory=Counter)
+
+
+class _Came(NamedTuple):
+    """A message as it came: when, and after which time it left the fleet's broker."""
+
+    packet: Publish
+    at: float
+    left_after: float
+    #: Whether it is refused, in its turn: acknowledgements keep the order.
+    is_refused: bool = False
+
+    @property
+    def size(self) -> int:
+        """The bytes that are counted while it waits."""
+        packet = self.packet
+        return text_size(packet.topic) + len(packet.payload) + len(packet.passed_on) + OVERHEAD
+
+
+class InSession:
+    """Publishes here what comes on one connection; made when that is up, `detach`ed when it ends.
+
+    `freshness` is to be told of the connection's PINGREQs and PINGRESPs. After `receive` and
+    `take_turn`, `Broker.flush` is to be called; several may be in between.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        settings: UpstreamSettings,
+        rules: LinkRules,
+        answers: Answers,
+        answering: Session,
+        connection: InConnection,
+        counters: InCounters,
+        *,
+        connected_at: float,
+        is_kept: bool = False,
+    ) -> None:
+        """`answering` is `OutSession.answering`. `is_kept`: the session there outlives its
+        connections. `connected_at` is when CONNECT was sent."""
+        self.freshness = Freshness() if is_kept else Freshness(connected_at)
+        self._broker = broker
+        self._settings = settings
+        self._rules = rules
+        self._answers = answers
+        self._answering = answering
+        self._connection = connection
+        self._counters = counters
+        self._is_kept = is_kept
+        name = settings.name
+        client_id = kept_client_id(name) if is_kept else in_client_id(name)
+        identity = Identity(settings.user, client_id)
+        self._session = broker.attach(client_id, _InLink(connection), identity)
+        self._acknowledgements = Acknowledgements(broker, self)
+        self._is_detached = False
+        #: What waits, the first of it for receivers or decisions, or for this session's turn.
+        self._waiting: deque[_Came] = deque()
+        self._waiting_bytes = 0
+        self._is_paused = False
+        #: The time and the cost at which this turn ends.
+        self._turn_at = -1.0
+        self._turn_ends = 0
+        #: Since when the first one waits for decisions; None when it does not.
+        self._undecided_since: float | None = None
+        self._allowance = Allowance(PUBLISHER_PATIENCE)
+        self._awaited: Sequence[Congestion] = ()
+        self._waits_since = 0.0
+        #: The sum over the awaited congestions at that time.
+        self._reader_time = 0.0
+
+    def __str__(self) -> str:
+        return str(self._session)
+
+    @property
+    def waiting(self) -> int:
+        """Messages that wait here."""
+        return len(self._waiting)
+
+    def detach(self) -> None:
+        """The connection has ended: drop what waits, unacknowledged; may be called twice."""
+        if self._is_detached:
+            return
+        self._is_detached = True
+        self._acknowledgements.close()
+        self._stop_waiting()
+        self._waiting.clear()
+        self._count(-self._waiting_bytes)
+        self._broker.detach(self._session)
+
+    # --- input, and turns ----------------------------------------------------------------------
+
+    def receive(self, packet: Publish, now: float) -> None:
+        """A PUBLISH of QoS 0 or 1 has come, whose topic is valid."""
+        if self._is_detached:
+            return
+        self._begin_turn(now)
+        self._counters.received += 1
+        self._broker.counters.cost += PACKET_COST
+        came = _Came(packet, now, self.freshness.left_after(packet.qos))
+        if packet.qos:
+            self.freshness.message_received()
+        if not self._waiting and not self._is_turn_over and self._publish(came):
+            return
+        if self._is_detached:
+            return
+        if len(self._waiting) >= 2 * WAITING_MESSAGES or self._waiting_bytes >= 2 * WAITING_BYTES:
+            if not packet.qos:
+                self._counters.refused += 1
+                return
+            # No more of these come than the Receive Maximum of the link allows.
+            rest = Publish(packet.topic, b"", packet.qos, packet_id=packet.packet_id)
+            came = _Came(rest, now, came.left_after, is_refused=True)
+        if not self._waiting and self._is_turn_over:
+            self._connection.later(0)
+        self._waiting.append(came)
+        self._count(came.size)
+        if not self._is_paused and self._has_much:
+            self._is_paused = True
+            self._connection.pause_reading()
+
+    @property
+    def _has_much(self) -> bool:
+        return len(self._waiting) >= WAITING_MESSAGES or self._waiting_bytes >= WAITING_BYTES
+
+    def take_turn(self, now: float) -> None:
+        """Publish what waits, as far as it need not wait longer."""
+        if self._is_detached:
+            return
+        self._turn_at = -1.0
+        self._begin_turn(now)
+        self._count_wait(now)
+        while self._waiting:
+            if self._is_turn_over:
+                self._connection.later(0)
+                return
+            came = self._waiting[0]
+            if not self._publish(came) or self._is_detached:
+                return
+            self._waiting.popleft()
+            self._count(-came.size)
+        if self._is_paused:
+            self._is_paused = False
+            self._connection.resume_reading()
+
+    def proceed(self) -> None:
+        """Waiting: a receiver that the first message waits for has room again."""
+        self._connection.later(0)
+
+    def _wake(self) -> None:
+        """A pending decision that the first message waits for has been made."""
+        if not self._is_detached:
+            self._connection.later(0)
+
+    def _begin_turn(self, now: float) -> None:
+        accounting = self._broker.accounting
+        accounting.now = now
+        if now != self._turn_at:  # another chunk, or a turn that was asked for
+            self._turn_at = now
+            self._turn_ends = accounting.counters.cost + COST_PER_TURN
+
+    @property
+    def _is_turn_over(self) -> bool:
+        return self._broker.counters.cost > self._turn_ends
+
+    def _count(self, size: int) -> None:
+        """Count the memory of messages that wait."""
+        self._waiting_bytes += size
+        accounting = self._broker.accounting
+        accounting.take(self._session.account, size)
+        accounting.input_bytes += size
+
+    # --- what is done with a message -----------------------------------------------------------
+
+    def _publish(self, came: _Came) -> bool:
+        """Publish it, or drop or refuse it; False if it has to wait."""
+        packet = came.packet
+        if came.is_refused:
+            reason = "too much waits for its receivers here"
+            self._refuse(packet, ReasonCode.QUOTA_EXCEEDED, reason)
+            return True
+        answers_there = self._settings.answers_there
+        if packet.topic.startswith(answers_there) or "/_reply/" in packet.topic:
+            topic = self._answers.for_answer_in(packet.topic, self._broker.now)
+            if topic is not None:
+                return self._publish_answer(came, topic)
+            if packet.topic.startswith(answers_there):
+                self._counters.unexpected_answers += 1
+                self._acknowledge(packet, ReasonCode.SUCCESS)
+                return True
+        found = self._rules.inward(packet.topic)
+        if found is None:
+            self._counters.uncarried += 1
+            self._acknowledge(packet, ReasonCode.SUCCESS)
+            return True
+        rule, topic = found
+        why = circle(packet.passed_on, self._settings.robot)
+        if why:
+            self._counters.circles += 1
+            self._broker.log_rate_limited(
+                self._session, "drops a message for %s: %s", quote(topic), why
+            )
+            self._acknowledge(packet, ReasonCode.SUCCESS)
+            return True
+        if self._is_dropped(came, rule, topic):
+            return True
+        message = self._message(came, topic)
+        return self._deliver(came, message, self._session)
+
+    def _is_dropped(self, came: _Came, rule: InRule, topic: str) -> bool:
+        packet = came.packet
+        expiry = (packet.properties or {}).get(Property.MESSAGE_EXPIRY_INTERVAL)
+        verdict = judge(
+            now=self._broker.now,
+            arrived_at=came.at,
+            left_after=came.left_after,
+            late=None if rule.offline == "keep" else rule.late,
+            expiry=expiry if isinstance(expiry, int) else None,
+            dup=packet.dup,
+            retain=packet.retain,
+        )
+        if verdict is Verdict.TAKE:
+            return False
+        self._counters.dropped[rule.remote_filter, verdict] += 1
+        self._broker.log_rate_limited(
+            self._session,
+            "drops a message for %s: %s (it may be %.3g s old)",
+            quote(topic),
+            verdict.value,
+            self._broker.now - came.left_after,
+        )
+        self._acknowledge(packet, ReasonCode.SUCCESS)
+        return True
+
+    def _message(self, came: _Came, topic: str) -> Message:
+        """The message here: with its greatest age, and a Response Topic of ours if it has one."""
+        packet, now = came.packet, self._broker.now
+        values = packet.properties or {}
+        wire = packet.passed_on
+        wanted = values.get(Property.RESPONSE_TOPIC)
+        if wanted is not None or reply_topic(packet.topic) is not None:
+            self._broker.counters.cost += REQUEST_COST
+            text = wanted if isinstance(wanted, str) else None
+            response_topic = self._answers.for_request_in(packet.topic, text, now)
+            properties = decode_properties(wire, 0, len(wire), PacketType.PUBLISH)[0] or {}
+            properties.pop(Property.RESPONSE_TOPIC, None)
+            if response_topic is not None:
+                properties[Property.RESPONSE_TOPIC] = response_topic
+            wire = encode_properties(properties)
+        interval = values.get(Property.MESSAGE_EXPIRY_INTERVAL)
+        expires_at = came.at + interval if isinstance(interval, int) else None
+        message = Message(
+            topic,
+            packet.payload,
+            packet.qos,
+            packet.retain,
+            expires_at=expires_at,
+            properties_wire=wire,
+        )
+        age = greatest_age(
+            now=now, left_after=came.left_after, dup=packet.dup, retain=packet.retain
+        )
+        return DelayedMessage(message, age)
+
+    def _publish_answer(self, came: _Came, topic: str) -> bool:
+        """Publish an answer where a requester here waits for it, who may publish there itself."""
+        packet = came.packet
+        if topic in self._broker.guards:  # of a route to ROS that has come since
+            self._counters.unexpected_answers += 1
+            self._acknowledge(packet, ReasonCode.SUCCESS)
+            return True
+        message = Message(topic, packet.payload, packet.qos, properties_wire=packet.passed_on)
+        return self._deliver(came, message, self._answering)
+
+    def _deliver(self, came: _Came, message: Message, origin: Session) -> bool:
+        """Publish it as a session; False if it has to wait for its receivers or for decisions."""
+        packet, broker = came.packet, self._broker
+        try:
+            route = broker.route(origin, message.topic_wire)
+        except (ProtocolError, ValueError) as error:  # it is too long here, or has too many levels
+            self._refuse(packet, ReasonCode.TOPIC_NAME_INVALID, str(error))
+            return True
+        if route.undecided and self._waits_for_decisions(route):
+            return False
+        self._undecided_since = None
+        if route.allowed and packet.qos and self._waits_for_receivers(route, message):
+            return False
+        checks = broker.features.check_payload_format
+        if checks and route.allowed and not is_text(packet.payload, packet.properties):
+            reason = "the payload is marked as UTF-8 text and is not"
+            self._refuse(packet, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
+            return True
+        targets = route.targets
+        if packet.retain:
+            # It may be an old one: a route to ROS gets it as one that was retained before.
+            targets = [
+                (session, qos, as_published or session.is_inside, ids)
+                for session, qos, as_published, ids in targets
+            ]
+        code: int = broker.publish_to(targets, route, message, origin)
+        if message.rejection is not None:
+            code, message.rejection = message.rejection.code, None
+        if code >= 0x80:
+            self._counters.refused += 1
+            self._acknowledge_refusal(packet, code)
+        else:
+            self._counters.delivered += 1
+            self._acknowledge(packet, ReasonCode.SUCCESS)
+        return True
+
+    # --- waiting -------------------------------------------------------------------------------
+
+    def _waits_for_decisions(self, route: Fanout) -> bool:
+        """Whether a plugin has still to decide; receivers are waited for for a moment only."""
+        pending = self._broker.router.pending_decisions
+        if pending is None:
+            return False
+        now = self._broker.now
+        if self._undecided_since is None:
+            self._undecided_since = now
+        own = [query for query in route.undecided if query[0].client_id == self._session.client_id]
+        patience = pending.timeout if own else RIGHTS_PATIENCE
+        left = self._undecided_since + patience - now
+        if left <= 0:
+            return False
+        if not [each for each in route.undecided if pending.is_pending(each, self._wake)]:
+            return False
+        self._connection.later(max(left, RECHECK))
+        return True
+
+    def _waits_for_receivers(self, route: Fanout, message: Message) -> bool:
+        """Whether receivers have no room now, but soon will: see `broker.backpressure`."""
+        broker, allowance = self._broker, self._allowance
+        congestions = broker.congestions(route, message) if broker.accounting.congested else []
+        if not congestions or allowance.used_up:
+            if allowance.left < PUBLISHER_PATIENCE:
+                allowance.change(MESSAGE_PATIENCE)
+            self._stop_waiting()
+            return False
+        for congestion in self._awaited:
+            if congestion not in congestions:
+                congestion.forget(self)
+        self._awaited = congestions
+        self._waits_since = broker.now
+        self._reader_time = sum(congestion.reader_time() for congestion in congestions)
+        seconds = allowance.left
+        for congestion in congestions:
+            congestion.wait(self)
+            seconds = min(seconds, congestion.left)
+        self._connection.later(max(seconds, RECHECK))
+        return True
+
+    def _count_wait(self, now: float) -> None:
+        """Spend the time for which the first message has waited for its receivers."""
+        if not self._awaited:
+            return
+        reader_time = sum(congestion.reader_time() for congestion in self._awaited)
+        waited = now - self._waits_since
+        counted = min(max(reader_time - self._reader_time, waited * LEAST_COUNTED), waited)
+        self._allowance.change(-counted)
+        self._waits_since, self._reader_time = now, reader_time
+
+    def _stop_waiting(self) -> None:
+        for congestion in self._awaited:
+            congestion.forget(self)
+        self._awaited = ()
+
+    # --- acknowledgements ----------------------------------------------------------------------
+
+    def _refuse(self, packet: Publish, code: ReasonCode, reason: str) -> None:
+        self._counters.refused += 1
+        self._broker.log_rate_limited(
+            self._session, "may not publish what came on %s: %s", quote(packet.topic), reason
+        )
+        self._acknowledge_refusal(packet, code)
+
+    def _acknowledge_refusal(self, packet: Publish, code: int) -> None:
+        is_failing = code == ReasonCode.QUOTA_EXCEEDED and self._broker.accounting.failing
+        if is_failing and packet.qos and (self._is_kept or self._connection.version != V5):
+            # A session that is kept there sends it again; and 3.1.1 cannot refuse.
+            self._close(ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
+            return
+        self._acknowledge(packet, code if code in _OF_CLIENTS else ReasonCode.UNSPECIFIED_ERROR)
+
+    def _acknowledge(self, packet: Publish, code: int) -> None:
+        if packet.qos and packet.packet_id is not None:
+            self._acknowledgements.add(packet.packet_id, code)
+
+    def acknowledge(self, packet_id: int, code: int) -> None:
+        """AckLink: send a PUBACK, whose turn has come."""
+        self.freshness.message_acknowledged()
+        self._connection.acknowledge(packet_id, code)
+
+    def abandon(self) -> None:
+        """AckLink: what was to be acknowledged could not be stored."""
+        self._close(ReasonCode.UNSPECIFIED_ERROR, CANNOT_KEEP)
+
+    def _close(self, code: ReasonCode, reason: str) -> None:
+        self._acknowledgements.close()
+        self._connection.close(code, reason)
+
+
+class _InLink(InsideLink):
+    """The link of the session: who asks how its client is, asks about the fleet's broker."""
+
+    def __init__(self, connection: InConnection) -> None:
+        self._connection = connection
+
+    def peer_status(self) -> PeerStatus:
+        """The state of the connection to the fleet's broker."""
+        return self._connection.peer_status()
+
+    def probe(self) -> None:
+        """Make the fleet's broker answer, if it can be reached."""
+        self._connection.probe()
+
+    def close(self, reason: ReasonCode, message: str) -> None:
+        """End the connection."""
+        self._connection.close(reason, message)
