@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.config.settings import (
+    BacklogSection,
+    InSection,
+    OutSection,
+    UpstreamLoginSection,
+    UpstreamSection,
+    UpstreamTlsSection,
+)
 from appliance.mqtt.codec import V5, V311
 from appliance.mqtt.topics import MAX_TOPIC, check_filter, check_topic, matches
+from appliance.upstream.limits import KINDS
 from appliance.upstream.rules import (
     LATE,
     CommandTopics,
@@ -288,3 +298,32 @@ def test_overlapping_rules_are_named() -> None:
         ("a/#", "+/x"),
         ("b", "b"),
     ]
+
+
+PAGE = (Path(__file__).parents[2] / "docs/upstream.md").read_text()
+
+
+def test_the_examples_of_the_page_are_mapped_so() -> None:
+    rows = re.findall(r"^\| `(\{topic.+?\})` \| `(.+?)` \| `(.+?)` \|$", PAGE, re.M)
+    assert len(rows) >= 5
+    for rule, here, there in rows:
+        settings = link(f"out: [{rule}]", robot="r2d2")
+        found = LinkRules(settings).out(here)
+        assert found is not None and found[1] == there, rule
+        if here[0] != "$":
+            back = LinkRules(link(f"in: [{rule}]", robot="r2d2")).inward(there)
+            assert back is not None and back[1] == here, rule
+
+
+def test_the_page_has_every_key() -> None:
+    sections = (
+        UpstreamSection,
+        UpstreamLoginSection,
+        UpstreamTlsSection,
+        BacklogSection,
+        OutSection,
+        InSection,
+    )
+    keys = {field.alias or name for each in sections for name, field in each.model_fields.items()}
+    assert {key for key in keys if f"`{key}`" not in PAGE} == set()
+    assert {kind for kind in KINDS if f"`{kind}`" not in PAGE} == set()
