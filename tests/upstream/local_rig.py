@@ -103,6 +103,7 @@ class FakeConnection:
         self.turn_in: float | None = None
         self.is_paused = False
         self.probes = 0
+        self.silence = 0.0
         self.session: InSession | None = None
 
     def acknowledge(self, packet_id: int, code: int) -> None:
@@ -126,7 +127,7 @@ class FakeConnection:
             self.session.detach()
 
     def peer_status(self) -> PeerStatus:
-        return PeerStatus(round_trip=0.05)
+        return PeerStatus(round_trip=0.05, silence=self.silence)
 
     def probe(self) -> None:
         self.probes += 1
@@ -148,15 +149,17 @@ class Rig:
         store: Store | None = None,
         limits: Limits | None = None,
         features: Features | None = None,
+        robot: str = "r2",
     ) -> None:
+        self.robot = robot
         self.acl = folder / "acl.conf"
         self.acl.write_text(acl)
-        self.access = FileAccess(None, self.acl, "r2", True)
+        self.access = FileAccess(None, self.acl, robot, True)
         self.store = store or FakeStore()
         self.broker = Broker(self.access, self.store, limits, features)
         self.now = 1000.0
         self.broker.tick(self.now)
-        self.settings = link(" ".join(keys.split()))
+        self.settings = link(" ".join(keys.split()), robot=robot)
         self.rules = LinkRules(self.settings)
         self.answers = Answers(self.settings)
         self.backlog = FakeBacklog()
@@ -190,7 +193,7 @@ class Rig:
 
     def reload(self, acl: str) -> None:
         self.acl.write_text(acl)
-        self.access.adopt(Rules.read(None, self.acl, "r2", True))
+        self.access.adopt(Rules.read(None, self.acl, self.robot, True))
         self.broker.rules_changed()
         self.broker.flush()
 

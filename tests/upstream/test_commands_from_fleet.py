@@ -1,0 +1,157 @@
+"""A robot that a fleet drives over a link: late commands do not reach ROS, and it stops in time.
+
+The bridge, its routes and the broker are the real ones, on a FakeNode.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from waiting import until
+
+from appliance.mqtt.reason import ReasonCode
+from appliance.ros.topics.rules import CommandRules, OnSilence
+from appliance.upstream.late import LEAST_WINDOW, Verdict
+
+pytest.importorskip("geometry_msgs.msg")
+from command_harness import AFTER, GO, STOP, CommandHarness, twist
+
+from .local_rig import Fleet, Rig
+
+KEYS = 'user: upstream, out: [], in: [{topic: cmd_vel, late: 500 ms}, {topic: "reset/#"}]'
+TOPIC = "fleet/r2d2/cmd_vel"
+
+
+class Robot(CommandHarness):
+    """A robot with a route for commands, and a link to a fleet."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.loop = asyncio.get_running_loop()
+        self.rig = Rig(folder, acl="user upstream\ntopic readwrite #\n", keys=KEYS, robot="r2d2")
+        self.broker = self.rig.broker
+        self.rig.now = self.loop.time()
+        self.broker.tick(self.rig.now)
+        self.rig.begin()
+
+    def join(self) -> Fleet:
+        self.rig.now = self.loop.time()
+        return self.rig.connect()
+
+    def say(self, fleet: Fleet, payload: bytes = GO, qos: int = 0, topic: str = TOPIC) -> int:
+        """A command that has come over the connection just now."""
+        self.rig.now = self.loop.time()
+        return fleet.send(topic, payload, qos)
+
+    async def drive(self, fleet: Fleet, seconds: float, qos: int = 0) -> None:
+        """Steer at 20 Hz, with a PINGREQ each time that is answered at once."""
+        end = self.loop.time() + seconds
+        while self.loop.time() < end:
+            self.rig.now = self.loop.time()
+            fleet.ping()
+            self.say(fleet, qos=qos)
+            await asyncio.sleep(0.05)
+
+
+@pytest.fixture
+async def robot(tmp_path: Path) -> AsyncIterator[Robot]:
+    robot = Robot(tmp_path)
+    yield robot
+    await robot.bridge.stop()
+    assert not robot.broker.guards
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+async def test_the_robot_stops_when_the_link_ends(robot: Robot, qos: int) -> None:
+    robot.start(CommandRules(expire=0.5, on_silence=OnSilence(60.0)))
+    fleet = robot.join()
+    await robot.drive(fleet, 0.5, qos)
+    received = robot.robot.received
+    assert received and set(received) == {twist(0.5)}
+    fleet.session.detach()
+    assert received[-1] == STOP and robot.counters().stops == 1  # at once
+    # And what was on its way behind it does not start it again.
+    robot.say(fleet)
+    assert received[-1] == STOP
+
+
+async def test_the_robot_stops_when_the_fleet_falls_silent(robot: Robot) -> None:
+    robot.start(CommandRules(expire=0.5, on_silence=OnSilence(AFTER)))
+    fleet = robot.join()
+    await robot.drive(fleet, 0.5)
+    await until(lambda: robot.robot.received[-1] == STOP, "the robot to stop")
+    assert robot.counters().stops and not fleet.connection.closed
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+async def test_a_thousand_late_commands_never_reach_ros(robot: Robot, qos: int) -> None:
+    """A network that was silent for ten seconds, and then hands over all that it has held."""
+    robot.start(CommandRules(expire=0.5, on_silence=OnSilence(AFTER)))
+    fleet = robot.join()
+    await robot.drive(fleet, 0.3, qos)
+    await until(lambda: robot.robot.received[-1] == STOP, "the robot to stop")
+    received = list(robot.robot.received)
+    freshness = fleet.session.freshness
+    robot.rig.now = robot.loop.time()
+    freshness.ping_sent(robot.rig.now)  # is lost in the silence, and answered after it
+    await asyncio.sleep(0.6)  # as ten seconds: longer than `late`
+    for number in range(1000):
+        if number == LEAST_WINDOW:  # what was in flight when the network fell silent, and the rest
+            freshness.ping_answered()
+        robot.say(fleet, qos=qos)
+        while fleet.connection.turn_in is not None:
+            fleet.turn()
+    assert robot.robot.received == received
+    late = robot.rig.counters.dropped["fleet/r2d2/cmd_vel", Verdict.LATE]
+    assert late == 1000 and robot.counters().expired == 0
+    # Then there is a new PINGREQ, and somebody steers again.
+    await robot.drive(fleet, 0.5, qos)
+    assert twist(0.5) in robot.robot.received[len(received) :]
+
+
+async def test_a_command_is_judged_again_by_its_route(robot: Robot) -> None:
+    """By a route that is stricter than the rule: with the greatest age that it can have."""
+    robot.start(CommandRules(expire=0.1))
+    fleet = robot.join()
+    await asyncio.sleep(0.2)
+    robot.say(fleet)
+    await asyncio.sleep(0.3)
+    assert robot.robot.received == [] and robot.counters().expired == 1
+
+
+async def test_a_retained_command_of_the_fleet_does_not_reach_ros(robot: Robot) -> None:
+    for rules in (CommandRules(), CommandRules(expire=0.5)):
+        robot.start(rules)
+        fleet = robot.join()
+        assert fleet.send(TOPIC, GO, 1, retain=True) == 0
+        await robot.settle()
+        assert robot.robot.received == []
+        assert robot.broker.retained.get("r2d2/cmd_vel") is not None
+        fleet.session.detach()
+        await robot.bridge.stop()
+
+
+async def test_the_fleet_holds_the_lease_and_loses_it_with_the_link(robot: Robot) -> None:
+    robot.start(CommandRules(exclusive=True, lease=600, on_silence=OnSilence(600.0)))
+    fleet = robot.join()
+    peer = robot.rig.join("other", user="upstream")
+    await robot.drive(fleet, 0.3)
+    assert robot.counters().commanding == (("/cmd_vel", "_upstream_in.fleet"),)
+    assert peer.publish("r2d2/cmd_vel", GO, 1) == 0x87
+    fleet.session.detach()
+    assert robot.counters().commanding == ()
+    assert peer.publish("r2d2/cmd_vel", GO, 1) == 0
+
+
+async def test_a_fleet_that_does_not_answer_any_more_is_disconnected(robot: Robot) -> None:
+    """What it has on its way is late when it comes, and nothing in it shows that."""
+    robot.start(CommandRules(on_silence=OnSilence(AFTER, "{}", disconnect=True)))
+    fleet = robot.join()
+    await robot.drive(fleet, 0.3)
+    fleet.connection.silence = 60.0
+    await until(lambda: bool(fleet.connection.closed), "the end of the connection")
+    assert fleet.connection.probes == 1
+    assert [code for code, _ in fleet.connection.closed] == [ReasonCode.ADMINISTRATIVE_ACTION]
