@@ -94,8 +94,10 @@ LATE_TICK: Final = 1.0
 #: PINGREQs without an answer, at most.
 MAXIMUM_PINGS: Final = 1000
 
-#: Entries of each table of encoded topics and headers; a full one is emptied.
-CACHED: Final = 4096
+#: Entries of each table of encoded topics and headers; a full one is emptied. Longer topics, in
+#: bytes, are not in them.
+CACHED: Final = 1024
+LONGEST_CACHED: Final = 256
 
 #: Bytes of a SUBSCRIBE beside its filters: header, packet identifier, subscription identifier.
 _PACKET_ROOM: Final = 16
@@ -617,7 +619,8 @@ class FleetConnection(Generic[T]):
                 raise malformed(str(error)) from None
             if len(self._heard) >= CACHED:
                 self._heard.clear()
-            self._heard[topic_wire] = topic
+            if len(topic_wire) <= LONGEST_CACHED:
+                self._heard[topic_wire] = topic
         qos = first >> 1 & 3
         dup = first >= 0x38
         if qos and not self._expects(packet_id, qos, dup):
@@ -735,7 +738,8 @@ class FleetConnection(Generic[T]):
         wire = encode_string(topic)
         if len(self._topics) >= CACHED:
             self._topics.clear()
-        self._topics[topic] = wire
+        if len(wire) <= LONGEST_CACHED:
+            self._topics[topic] = wire
         return wire
 
     def _encode_header(self, first: int, size: int) -> bytes:

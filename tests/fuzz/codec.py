@@ -5,19 +5,44 @@ from __future__ import annotations
 import random
 from collections.abc import Iterable
 
-from inputs import Source, chunks, damage
+from inputs import CLIENTS_OWN, Source, chunks, damage
 
-from appliance.mqtt.codec import PacketType, decode_string, decode_varint
+from appliance.mqtt.client_protocol import ClientProtocol
+from appliance.mqtt.codec import PacketType, Properties, Property, decode_string, decode_varint
 from appliance.mqtt.connection import ServerProtocol
-from appliance.mqtt.framing import ALIAS_SIZE, RawPublish
-from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, decode_packet
-from appliance.mqtt.reason import ProtocolError
+from appliance.mqtt.framing import ALIAS_SIZE, PacketFramer, RawPublish
+from appliance.mqtt.packets import (
+    Connack,
+    Connect,
+    Packet,
+    Puback,
+    Pubcomp,
+    Publish,
+    Pubrec,
+    Pubrel,
+    decode_packet,
+)
+from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 MAXIMUM = 100_000
 ALIASES = 10
 
 #: Characters of a packet in a log line.
 LINE = 1000
+
+#: What a server sends behind CONNACK.
+SERVERS_OWN = (
+    PacketType.PUBLISH,
+    PacketType.PUBLISH,
+    PacketType.PUBACK,
+    PacketType.PUBREC,
+    PacketType.PUBREL,
+    PacketType.PUBCOMP,
+    PacketType.SUBACK,
+    PacketType.UNSUBACK,
+    PacketType.PINGRESP,
+    PacketType.DISCONNECT,
+)
 
 _ACKNOWLEDGEMENTS = {cls.TYPE: cls for cls in (Puback, Pubrec, Pubrel, Pubcomp)}
 
@@ -41,13 +66,15 @@ def one_case(rng: random.Random) -> None:
             other = _any_packet(source, version).encode(version)
             decode_one(damage(rng, wire, other), rng.choice((4, 5)))
         return
-    packets = [source.packet(version).encode(version) for _ in range(rng.randint(1, 6))]
+    to_client = rng.random() < 0.4
+    kinds = SERVERS_OWN if to_client else CLIENTS_OWN
+    packets = [source.packet(version, kinds).encode(version) for _ in range(rng.randint(1, 6))]
     if rng.random() < 0.5:
         packets *= 2  # a client that repeats itself is recognised by that
     if rng.random() < 0.7:
         index = rng.randrange(len(packets))
         packets[index] = damage(rng, packets[index], rng.choice(packets))
-    read_stream(b"".join(packets), version, rng)
+    read_stream(b"".join(packets), version, rng, to_client=to_client)
 
 
 def _any_packet(source: Source, version: int) -> Packet:
@@ -86,31 +113,46 @@ def decode_one(wire: bytes, version: int) -> None:
         raise Found(f"version {version}, said again: {error!r}", wire) from error
 
 
-def read_stream(wire: bytes, version: int, rng: random.Random) -> None:
+def read_stream(wire: bytes, version: int, rng: random.Random, *, to_client: bool) -> None:
     """However the bytes are cut, they are the same packets and the same end."""
-    whole = _read([wire], version)
-    cut = _read(chunks(rng, wire), version)
+    whole = _read([wire], version, to_client)
+    cut = _read(chunks(rng, wire), version, to_client)
     if whole != cut:
         raise Found(f"version {version}: whole it is {whole}, cut it is {cut}", wire)
 
 
-def _read(parts: Iterable[bytes], version: int) -> tuple[list[Packet], int]:
-    """The packets in it, and the code of the error that ended it, 0 for none."""
-    connection = ServerProtocol(MAXIMUM, ALIASES)
+def _client(version: int) -> ClientProtocol:
+    """The client side of a connection, behind CONNACK."""
+    aliases: Properties = {Property.TOPIC_ALIAS_MAXIMUM: ALIASES}
+    client = ClientProtocol(Connect("client", version=version, properties=aliases), MAXIMUM)
+    list(client.receive_data(Connack().encode(version)))
+    return client
+
+
+def _server(version: int) -> ServerProtocol:
+    """The server side of a connection, behind the login."""
+    server = ServerProtocol(MAXIMUM, ALIASES)
     connect = Source(random.Random(0)).packet(version, [PacketType.CONNECT])
+    list(server.receive_data(connect.encode(version)))
+    server.accept()
+    return server
+
+
+def _read(parts: Iterable[bytes], version: int, to_client: bool) -> tuple[list[Packet], int]:
+    """The packets in it, and the code of the error that ended it, 0 for none."""
+    connection: PacketFramer = _client(version) if to_client else _server(version)
     done = b""
     packets: list[Packet] = []
     try:
-        list(connection.receive_data(connect.encode(version)))
-        connection.accept()
         for part in parts:
             done += part
             for event in connection.receive_data(part):
                 if isinstance(event, tuple):
                     packets.append(_as_publish(event, version, connection))
                 elif isinstance(event, int):
-                    kind = PacketType(event >> 16)
-                    packets.append(_ACKNOWLEDGEMENTS[kind](event & 0xFFFF))
+                    kind = PacketType(event >> 16 & 0xFF)
+                    code = ReasonCode(event >> 24)
+                    packets.append(_ACKNOWLEDGEMENTS[kind](event & 0xFFFF, code))
                 else:
                     packets.append(event)
         # A topic alias takes more than its bytes: up to four a character, and what is around it.
@@ -127,7 +169,7 @@ def _read(parts: Iterable[bytes], version: int) -> tuple[list[Packet], int]:
     return packets, 0
 
 
-def _as_publish(event: RawPublish, version: int, connection: ServerProtocol) -> Publish:
+def _as_publish(event: RawPublish, version: int, connection: PacketFramer) -> Publish:
     """What the short form says; its topic is looked at by who takes it, which ends it here too."""
     first, topic_wire, packet_id, payload, head = event
     body = topic_wire + (packet_id.to_bytes(2, "big") if packet_id else b"")

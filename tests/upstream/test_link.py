@@ -51,7 +51,13 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ReasonCode
 from appliance.store import MemoryStore
 from appliance.upstream.agreement import ConnectSettings, EndedBy
-from appliance.upstream.link import MAXIMUM_PINGS, PATIENCE, FleetConnection
+from appliance.upstream.link import (
+    CACHED,
+    LONGEST_CACHED,
+    MAXIMUM_PINGS,
+    PATIENCE,
+    FleetConnection,
+)
 from appliance.upstream.link_events import (
     Acknowledged,
     Arrived,
@@ -1062,6 +1068,21 @@ def test_random_damage_ends_connections_only():
             fake.say(bytes(data[start : start + size]))
             start += size
         assert len(fake.heard()) <= 40 * 3
+
+
+def test_topics_are_cached_within_bounds():
+    fake = Fake().open()
+    for n in range(CACHED + 10):
+        topic = f"{n}/" + "x" * (LONGEST_CACHED if n % 2 else 1)
+        fake.link.publish("t", topic, b"", 0)
+        fake.say(Publish(topic, b"x"))
+    assert [event.topic for event in fake.heard()] == [  # type: ignore[union-attr]
+        packet.topic  # type: ignore[union-attr]
+        for packet in fake.sent()
+    ]
+    for cache in (fake.link._topics, fake.link._heard):
+        assert len(cache) <= CACHED
+        assert all(len(key) <= LONGEST_CACHED for key in cache)
 
 
 def test_a_large_packet_is_refused_before_it_is_buffered():
