@@ -16,7 +16,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from appliance.store.rows import LOADED, Rows
+from appliance.store.salvage import salvage, salvage_backlog
 from appliance.store.schema import (
+    MIGRATIONS,
     DamagedError,
     Durability,
     StoreError,
@@ -24,6 +26,7 @@ from appliance.store.schema import (
     is_damage,
     is_lost,
     read_table,
+    version,
 )
 
 log = logging.getLogger("appliance.store")
@@ -154,7 +157,7 @@ def read(path: Path, durability: Durability) -> Contents:
             raise StoreError(
                 f"{path} is locked by another program: end that, or move the file away"
             ) from None
-        return _read_copy(path, error)
+        return _read_only(path, error)
 
 
 def _read(path: Path, durability: Durability) -> Contents:
@@ -193,11 +196,34 @@ def _check(connection: sqlite3.Connection, argument: str) -> None:
         raise DamagedError(verdict.replace("\n", " "))
 
 
-def _read_copy(path: Path, error: Exception) -> Contents:
-    """Read a copy: the disk is full or read-only, so SQLite cannot even read where the file is."""
+def _read_only(path: Path, error: Exception) -> Contents:
+    """Read it although the disk is full or read-only, so that SQLite cannot create its files."""
     problem = str(error)
     if not path.exists():
         return Contents(problem=problem)
+    try:
+        return Contents(_read_alone(path), problem=problem)
+    except DamagedError as damage:
+        return _set_aside(path, str(damage))
+    except (sqlite3.Error, UnicodeError):
+        return _read_copy(path, problem)
+
+
+def _read_alone(path: Path) -> Rows:
+    """Read it where it is, without an index to its log beside it, which only one process can.
+
+    Raises:
+        DamagedError: it is damaged.
+        sqlite3.Error, UnicodeError: it is, or it cannot be read in this way.
+    """
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+        if version(connection) != len(MIGRATIONS):
+            raise sqlite3.OperationalError("it is an older appliance's")
+        return _read_all(connection)
+
+
+def _read_copy(path: Path, problem: str) -> Contents:
     with tempfile.TemporaryDirectory(prefix="appliance-store-") as directory:
         copy = Path(directory) / path.name
         try:
@@ -242,59 +268,31 @@ def _user(uid: int) -> str:
 
 
 def _set_aside(path: Path, damage: str) -> Contents:
-    """Rename the damaged database to a name with the date, and salvage its rows."""
+    """Salvage the rows of the damaged database, and rename it to a name with the date."""
     aside = path.with_name(f"{path.name}.damaged-{time.strftime('%Y%m%dT%H%M%S')}")
+    beside = path.with_name(f"{path.name}.salvaged")
+    rows = salvage(path)
+    lost = salvage_backlog(path, rows, beside)
     try:
         for suffix in ("", _LOG):
             with contextlib.suppress(FileNotFoundError):
                 _beside(path, suffix).replace(_beside(aside, suffix))
         _beside(path, _INDEX).unlink(missing_ok=True)
+        if rows.segment:
+            beside.replace(path)
     except OSError as error:
+        beside.unlink(missing_ok=True)
         raise StoreError(
             f"{path} is damaged ({damage}) and cannot be set aside: {error.strerror}"
         ) from None
-    rows = salvage(aside)
     found = ", ".join(f"{len(rows.of(table))} {table.name.lower()}" for table in LOADED)
     log.error(
         "%s IS DAMAGED (%s). It was set aside as %s; what could be read of it is kept (%s), what "
-        "could not is lost",
+        "could not is lost%s",
         path,
         damage,
         aside,
         found,
+        f", such as {lost} segments of backlogs" if lost else "",
     )
     return Contents(rows, salvaged=True)
-
-
-def salvage(path: Path) -> Rows:
-    """All rows that can be read from a damaged database, which is not changed."""
-    rows = Rows()
-    with tempfile.TemporaryDirectory(prefix="appliance-store-") as directory:
-        for with_log in (True, False):
-            copy = Path(directory) / f"{with_log}.db"
-            with contextlib.suppress(OSError):
-                shutil.copyfile(path, copy)
-                if with_log and _beside(path, _LOG).exists():
-                    shutil.copyfile(_beside(path, _LOG), _beside(copy, _LOG))
-            rows = _salvage(copy)
-            if any(map(rows.of, LOADED)):
-                break  # reading it without its log as well would mix in an older state
-    return rows
-
-
-def _salvage(path: Path) -> Rows:
-    rows = Rows()
-    try:
-        connection = sqlite3.connect(path)
-    except sqlite3.Error:
-        return rows
-    with contextlib.closing(connection):
-        with contextlib.suppress(sqlite3.Error):  # so that damaged cells are not taken for rows
-            connection.execute("PRAGMA cell_size_check = ON")
-        for table in LOADED:
-            # From both ends, up to the damage.
-            for order in ("ASC", "DESC"):
-                with contextlib.suppress(sqlite3.Error, UnicodeError, OverflowError, DamagedError):
-                    for key, row in read_table(connection, table, order):
-                        rows.of(table).setdefault(key, row)
-    return rows

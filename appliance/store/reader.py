@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import queue
 import sqlite3
-import struct
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -161,7 +160,7 @@ def _read(connection: sqlite3.Connection, keys: list[int]) -> list[bytes]:
             if is_damage(error):
                 raise RecordsLostError(str(error)) from None
             raise
-        except (ValueError, TypeError, OverflowError, struct.error) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise RecordsLostError(str(error)) from None
         if not rows:
             raise RecordsLostError("they are not there")

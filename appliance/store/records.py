@@ -39,12 +39,16 @@ def join(records: list[bytes]) -> bytes:
     return b"".join((lengths, *records))
 
 
-def split(count: int, joined: bytes, checksum: int) -> list[bytes]:
-    """The records that were joined. Raises ValueError: they were damaged."""
-    if zlib.crc32(joined) != checksum or len(joined) < 4 * count:
+def split(length: int, joined: bytes, checksum: int) -> list[bytes]:
+    """The records that were joined.
+
+    Raises:
+        ValueError, TypeError: they were damaged.
+    """
+    if length < 1 or zlib.crc32(joined) != checksum or len(joined) < 4 * length:
         raise ValueError("the checksum is wrong")
-    lengths = struct.unpack_from(f"<{count}I", joined)
-    ends = list(accumulate(lengths, initial=4 * count))
+    lengths = struct.unpack_from(f"<{length}I", joined)
+    ends = list(accumulate(lengths, initial=4 * length))
     if ends[-1] != len(joined):
         raise ValueError("the lengths are wrong")
     return [joined[start:end] for start, end in pairwise(ends)]

@@ -119,7 +119,6 @@ class SqliteStore(StagingStore):
         committer = self._committer
         committer.start_keys(next_key)
         if contents.salvaged:
-            committer.open.first_id = 1  # nothing is in the new database
             for table in LOADED:
                 committer.open.rows[table].update(contents.rows.of(table))
         self._put_stamp()

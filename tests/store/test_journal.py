@@ -41,12 +41,16 @@ async def read(journal: Journal, segment: Segment) -> list[bytes] | Exception:
 async def unsettled(journal: Journal) -> list[bytes]:
     """All records that are not settled, in order."""
     found: list[bytes] = []
-    for segment in list(journal.segments()):
+    place = 0
+    while place < len(journal.segments()):  # those that are not held may be merged meanwhile
+        segment = journal.segments()[place]
         records = await read(journal, segment)
         assert isinstance(records, list), records
         assert len(records) == segment.count
         assert sum(map(len, records)) == segment.size
         found += records[segment.done :]
+        place += 1
+    for segment in list(journal.segments()):
         journal.release(segment)
     return found
 
