@@ -127,6 +127,7 @@ KINDS: Final[dict[BrokerKind, FleetLimits]] = {
     "generic": FleetLimits(),
     # docs.aws.amazon.com/general/latest/gr/iot-core.html, "message broker and protocol limits"
     "aws-iot": FleetLimits(
+        window=100,
         qos=1,
         packet_size=128 << 10,
         topic_size=256,

@@ -257,6 +257,21 @@ def test_what_others_can_read_or_change(here: Path) -> None:
     }
 
 
+def test_secrets_of_links_that_others_can_read(here: Path) -> None:
+    write(here)
+    with (here / "appliance.yaml").open("a") as file:
+        file.write(
+            "\nupstreams: [{name: fleet, servers: [mqtts://a], "
+            "login: {username: a, password_file: fleet.password}, "
+            "tls: {certificate: fleet.crt, key: fleet.key}}]\n"
+        )
+    for name in ("fleet.password", "fleet.key", "fleet.crt"):
+        (here / name).touch()
+        (here / name).chmod(0o644)
+    found = by_subject(secrets.permissions(config.load(here / "appliance.yaml"), None))
+    assert {Path(subject).name for subject in found} == {"fleet.password", "fleet.key"}
+
+
 def test_days_that_are_left(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = here / "certs"
     certs.issue_client(directory, "lost")

@@ -58,7 +58,10 @@ def test_the_lower_of_both_holds() -> None:
     found = KINDS["azure-event-grid"].announced(more, V5)
     assert (found.topic_aliases, found.packet_size, found.qos) == (10, 512 << 10, 1)
     assert (found.retain, found.identifiers) == (False, False)
-    assert KINDS["aws-iot"].announced(ANNOUNCED, V5).packet_size == 1000
+    aws = KINDS["aws-iot"]
+    assert aws.announced(ANNOUNCED, V5).packet_size == 1000
+    assert aws.announced(ANNOUNCED, V5).window == 20
+    assert aws.announced({}, V5).window == aws.announced(None, V311).window == 100
 
 
 def test_3_1_1_announces_nothing() -> None:

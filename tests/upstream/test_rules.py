@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.config import TopicRoute
 from appliance.config.settings import (
     BacklogSection,
     InSection,
@@ -29,6 +30,7 @@ from appliance.upstream.rules import (
     OutRule,
     default_late,
 )
+from appliance.upstream.settings import command_filters
 from upstream.links import link
 
 # The twin: topics and filters are lists of levels, prefixes are taken off character by character.
@@ -192,6 +194,10 @@ def test_no_rule_carries_what_is_the_links_own() -> None:
     other = LinkRules(
         link("out: [{topic: '#', local_prefix: x/}], in: [{topic: '#', remote_prefix: y/}]")
     )
+    elsewhere = LinkRules(link("out: [{topic: '#', remote_prefix: y/}]"))
+    assert {topic for topic in carried | own if elsewhere.out(topic)} - {"r2/_answers/0123"} == (
+        carried
+    )
     assert other.out("x/_answers/0123") is None and other.out("x/_appliance/state") is None
     assert other.inward("y/_upstream/fleet/0123") is None
     assert other.out("x/odom") is not None and other.inward("y/odom") is not None
@@ -265,6 +271,23 @@ bridge:
     (found,) = link(f"in: [{rule}]", bridge).inward
     assert found.late == late
     assert link("in: [{topic: cmd_vel}]", "bridge: {bus: none}").inward[0].late == LATE
+
+
+@pytest.mark.parametrize(
+    ("route", "filters"),
+    [
+        ({"ros": "/cmd_vel"}, ["r2/cmd_vel"]),
+        ({"ros": "/cmd_vel", "mqtt": "cars/{robot}/drive"}, ["cars/r2/drive"]),
+        ({"ros": "/arm/*/cmd"}, ["r2/arm/+/cmd"]),
+        ({"ros": "/arm/left_*"}, ["r2/arm/+"]),
+        ({"ros": "/arm/**", "mqtt": "{robot}{ros}/set"}, ["r2/arm/#"]),
+        ({"ros": "/arm/x**/y"}, ["r2/arm/#"]),
+        ({"ros": ["/a/*", "/b", "!/a/x"]}, ["r2/a/+", "r2/b"]),
+    ],
+)
+def test_the_topics_that_a_route_takes(route: dict[str, object], filters: list[str]) -> None:
+    assert command_filters(TopicRoute.model_validate({"to": "ros", **route}), "r2") == filters
+    assert [check_filter(each) for each in filters]
 
 
 def test_late_of_overlapping_filters() -> None:

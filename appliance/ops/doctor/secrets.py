@@ -22,6 +22,9 @@ def permissions(settings: Settings, running: dict[str, Any] | None) -> Iterator[
     private = [tls.key, authority / "ca.key", broker.users, broker.store.path, settings.control]
     if broker.audit.path is not None:
         private.append(broker.audit.path)
+    for upstream in settings.upstreams:
+        secrets = upstream.login.password_file, upstream.login.token_file, upstream.tls.key
+        private += [path for path in secrets if path is not None]
     trusted = [broker.acl, tls.certificate, authority, broker.users.parent]
     trusted += [path for path in (tls.ca, settings.file) if path is not None]
     open_ones = [
