@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, Protocol
 
 from appliance.broker.backpressure import (
@@ -35,6 +35,7 @@ from appliance.broker.ports import Identity, InsideLink, PeerStatus
 from appliance.broker.routing import Fanout
 from appliance.broker.session import Session
 from appliance.mqtt.codec import (
+    NO_PROPERTIES,
     V5,
     PacketType,
     Property,
@@ -43,11 +44,11 @@ from appliance.mqtt.codec import (
     quote,
     text_size,
 )
-from appliance.mqtt.packets import Publish
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.upstream.acknowledgements import Acknowledgements
 from appliance.upstream.answers import Answers, reply_topic
-from appliance.upstream.late import Freshness, Verdict, greatest_age, judge
+from appliance.upstream.late import Verdict, greatest_age, judge
+from appliance.upstream.link_events import Arrived
 from appliance.upstream.loops import circle
 from appliance.upstream.rules import InRule, LinkRules, UpstreamSettings
 from appliance.upstream.sessions import in_client_id, kept_client_id
@@ -112,11 +113,10 @@ class InCounters:
 
 
 class _Came(NamedTuple):
-    """A message as it came: when, and after which time it left the fleet's broker."""
+    """A message as it came, and when."""
 
-    packet: Publish
+    packet: Arrived
     at: float
-    left_after: float
     #: Whether it is refused, in its turn: acknowledgements keep the order.
     is_refused: bool = False
 
@@ -124,14 +124,15 @@ class _Came(NamedTuple):
     def size(self) -> int:
         """The bytes that are counted while it waits."""
         packet = self.packet
-        return text_size(packet.topic) + len(packet.payload) + len(packet.passed_on) + OVERHEAD
+        return (
+            text_size(packet.topic) + len(packet.payload) + len(packet.properties_wire) + OVERHEAD
+        )
 
 
 class InSession:
     """Publishes here what comes on one connection; made when that is up, `detach`ed when it ends.
 
-    `freshness` is to be told of the connection's PINGREQs and PINGRESPs. After `receive` and
-    `take_turn`, `Broker.flush` is to be called; several may be in between.
+    After `receive` and `take_turn`, `Broker.flush` is to be called; several may be in between.
     """
 
     def __init__(
@@ -144,12 +145,10 @@ class InSession:
         connection: InConnection,
         counters: InCounters,
         *,
-        connected_at: float,
         is_kept: bool = False,
     ) -> None:
         """`answering` is `OutSession.answering`. `is_kept`: the session there outlives its
-        connections. `connected_at` is when CONNECT was sent."""
-        self.freshness = Freshness() if is_kept else Freshness(connected_at)
+        connections."""
         self._broker = broker
         self._settings = settings
         self._rules = rules
@@ -200,16 +199,14 @@ class InSession:
 
     # --- input, and turns ----------------------------------------------------------------------
 
-    def receive(self, packet: Publish, now: float) -> None:
-        """A PUBLISH of QoS 0 or 1 has come, whose topic is valid."""
+    def receive(self, packet: Arrived, now: float) -> None:
+        """A message has come on the connection."""
         if self._is_detached:
             return
         self._begin_turn(now)
         self._counters.received += 1
         self._broker.counters.cost += PACKET_COST
-        came = _Came(packet, now, self.freshness.left_after(packet.qos))
-        if packet.qos:
-            self.freshness.message_received()
+        came = _Came(packet, now)
         if not self._waiting and not self._is_turn_over and self._publish(came):
             return
         if self._is_detached:
@@ -219,8 +216,8 @@ class InSession:
                 self._counters.refused += 1
                 return
             # No more of these come than the Receive Maximum of the link allows.
-            rest = Publish(packet.topic, b"", packet.qos, packet_id=packet.packet_id)
-            came = _Came(rest, now, came.left_after, is_refused=True)
+            rest = replace(packet, payload=b"", properties=None, properties_wire=NO_PROPERTIES)
+            came = _Came(rest, now, is_refused=True)
         if not self._waiting and self._is_turn_over:
             self._connection.later(0)
         self._waiting.append(came)
@@ -304,7 +301,7 @@ class InSession:
             self._acknowledge(packet, ReasonCode.SUCCESS)
             return True
         rule, topic = found
-        why = circle(packet.passed_on, self._settings.robot)
+        why = circle(packet.properties_wire, self._settings.robot)
         if why:
             self._counters.circles += 1
             self._broker.log_rate_limited(
@@ -323,7 +320,7 @@ class InSession:
         verdict = judge(
             now=self._broker.now,
             arrived_at=came.at,
-            left_after=came.left_after,
+            left_after=packet.not_before,
             late=None if rule.offline == "keep" else rule.late,
             expiry=expiry if isinstance(expiry, int) else None,
             dup=packet.dup,
@@ -337,7 +334,7 @@ class InSession:
             "drops a message for %s: %s (it may be %.3g s old)",
             quote(topic),
             verdict.value,
-            self._broker.now - came.left_after,
+            self._broker.now - packet.not_before,
         )
         self._acknowledge(packet, ReasonCode.SUCCESS)
         return True
@@ -346,7 +343,7 @@ class InSession:
         """The message here: with its greatest age, and a Response Topic of ours if it has one."""
         packet, now = came.packet, self._broker.now
         values = packet.properties or {}
-        wire = packet.passed_on
+        wire = packet.properties_wire
         wanted = values.get(Property.RESPONSE_TOPIC)
         if wanted is not None or reply_topic(packet.topic) is not None:
             self._broker.counters.cost += REQUEST_COST
@@ -368,7 +365,7 @@ class InSession:
             properties_wire=wire,
         )
         age = greatest_age(
-            now=now, left_after=came.left_after, dup=packet.dup, retain=packet.retain
+            now=now, left_after=packet.not_before, dup=packet.dup, retain=packet.retain
         )
         return DelayedMessage(message, age)
 
@@ -379,7 +376,7 @@ class InSession:
             self._counters.unexpected_answers += 1
             self._acknowledge(packet, ReasonCode.SUCCESS)
             return True
-        message = Message(topic, packet.payload, packet.qos, properties_wire=packet.passed_on)
+        message = Message(topic, packet.payload, packet.qos, properties_wire=packet.properties_wire)
         return self._deliver(came, message, self._answering)
 
     def _deliver(self, came: _Came, message: Message, origin: Session) -> bool:
@@ -477,14 +474,14 @@ class InSession:
 
     # --- acknowledgements ----------------------------------------------------------------------
 
-    def _refuse(self, packet: Publish, code: ReasonCode, reason: str) -> None:
+    def _refuse(self, packet: Arrived, code: ReasonCode, reason: str) -> None:
         self._counters.refused += 1
         self._broker.log_rate_limited(
             self._session, "may not publish what came on %s: %s", quote(packet.topic), reason
         )
         self._acknowledge_refusal(packet, code)
 
-    def _acknowledge_refusal(self, packet: Publish, code: int) -> None:
+    def _acknowledge_refusal(self, packet: Arrived, code: int) -> None:
         is_failing = code == ReasonCode.QUOTA_EXCEEDED and self._broker.accounting.failing
         if is_failing and packet.qos and (self._is_kept or self._connection.version != V5):
             # A session that is kept there sends it again; and 3.1.1 cannot refuse.
@@ -492,13 +489,12 @@ class InSession:
             return
         self._acknowledge(packet, code if code in _OF_CLIENTS else ReasonCode.UNSPECIFIED_ERROR)
 
-    def _acknowledge(self, packet: Publish, code: int) -> None:
-        if packet.qos and packet.packet_id is not None:
+    def _acknowledge(self, packet: Arrived, code: int) -> None:
+        if packet.qos:
             self._acknowledgements.add(packet.packet_id, code)
 
     def acknowledge(self, packet_id: int, code: int) -> None:
         """AckLink: send a PUBACK, whose turn has come."""
-        self.freshness.message_acknowledged()
         self._connection.acknowledge(packet_id, code)
 
     def abandon(self) -> None:

@@ -66,9 +66,8 @@ def greatest_age(*, now: float, left_after: float, dup: bool, retain: bool) -> f
 
 
 class _Ping(NamedTuple):
-    """An unanswered PINGREQ: when it was sent, and what had come and was unacknowledged then."""
+    """An unanswered PINGREQ: how much had come and was unacknowledged when it went out."""
 
-    sent_at: float
     received: int
     unacknowledged: int
 
@@ -77,41 +76,40 @@ class Freshness:
     """Since when, at the earliest, what comes now can have left the fleet's broker.
 
     It belongs to one connection, and is told what is sent and received on it in that order; times
-    are in seconds of one clock. How many PINGREQs are unanswered is limited by the link, which ends
-    a connection that does not answer.
+    are in seconds of one clock.
     """
 
-    def __init__(self, connected_at: float = -math.inf) -> None:
-        """`connected_at` is when CONNECT was sent, if it was for a clean session: nothing is
-        queued in that. For a session that was kept it is minus infinity."""
-        self._left_after = self._sent_after = connected_at
+    def __init__(self) -> None:
+        self._left_after = self._sent_after = -math.inf
         self._pings: deque[_Ping] = deque()
         #: Messages of QoS 1 that were received, and how many of these are not acknowledged.
         self._received = 0
         self._unacknowledged = 0
 
-    def ping_sent(self, now: float) -> None:
-        """A PINGREQ goes out, behind all acknowledgements so far."""
-        self._pings.append(_Ping(now, self._received, self._unacknowledged))
+    def session_began(self, asked_at: float) -> None:
+        """The broker has made a new session, for a CONNECT of that time: nothing waits in it."""
+        self._left_after = self._sent_after = asked_at
 
-    def ping_answered(self) -> None:
-        """The PINGRESP to the oldest unanswered PINGREQ has come."""
-        if not self._pings:
-            return  # the link ends a connection with more answers than questions
+    def ping_sent(self) -> None:
+        """A PINGREQ goes out, behind all acknowledgements so far."""
+        self._pings.append(_Ping(self._received, self._unacknowledged))
+
+    def ping_answered(self, sent_at: float) -> None:
+        """The PINGRESP to the oldest unanswered PINGREQ has come, which was sent at that time."""
         ping = self._pings.popleft()
-        self._left_after = ping.sent_at
+        self._left_after = sent_at
         # So many can have been in flight at most when the broker answered it. If that is less than
         # its window, no message waited for the acknowledgement of another one then.
         if ping.unacknowledged + self._received - ping.received < LEAST_WINDOW:
-            self._sent_after = ping.sent_at
+            self._sent_after = sent_at
 
     def message_received(self) -> None:
-        """A PUBLISH of QoS 1 has come."""
+        """A PUBLISH of QoS 1 or 2 has come."""
         self._received += 1
         self._unacknowledged += 1
 
     def message_acknowledged(self) -> None:
-        """Its PUBACK goes out."""
+        """Its acknowledgement goes out."""
         self._unacknowledged -= 1
 
     def left_after(self, qos: int) -> float:

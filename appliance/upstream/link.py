@@ -63,6 +63,7 @@ from appliance.upstream.agreement import (
     granted_by,
     reason_string,
 )
+from appliance.upstream.late import Freshness
 from appliance.upstream.link_events import (
     Acknowledged,
     Arrived,
@@ -146,9 +147,8 @@ class FleetConnection(Generic[T]):
         self.ended: Ending | None = None
         #: Seconds from the sending of the last answered PINGREQ to its answer.
         self.round_trip: float | None = None
-        #: Nothing that arrives now left the broker before this time: when the last answered
-        #: PINGREQ, or CONNECT, was sent.
-        self.not_before = -math.inf
+        #: After which time what arrives now has left the broker.
+        self._freshness = Freshness()
         connect = settings.connect()
         self._connect = connect
         self._protocol = ClientProtocol(
@@ -186,6 +186,12 @@ class FleetConnection(Generic[T]):
         return f"connection as {quote(self.settings.client_id)}"
 
     # --- what the owner asks -------------------------------------------------------------------
+
+    @property
+    def not_before(self) -> float:
+        """No message of QoS 0 that arrives now left the broker before this time: when the last
+        answered PINGREQ, or CONNECT, was sent. See `Freshness` for QoS 1."""
+        return self._freshness.left_after(0)
 
     @property
     def room(self) -> int:
@@ -302,6 +308,7 @@ class FleetConnection(Generic[T]):
         if self.ended is not None:
             return
         for first, arrived_id, found in self._receipts.acknowledge(packet_id, code):
+            self._freshness.message_acknowledged()
             self._answer(first, arrived_id, found)
 
     def subscribe(self, subscriptions: Iterable[Subscription]) -> list[tuple[Subscription, int]]:
@@ -342,6 +349,7 @@ class FleetConnection(Generic[T]):
         """Send a PINGREQ, beside those that the keep alive needs; they bound `not_before`."""
         if self.ended is None and self.granted is not None and len(self._pings) < MAXIMUM_PINGS:
             self._pings.append(self._round)
+            self._freshness.ping_sent()
             self._send(_PINGREQ)
 
     def answer(self, data: bytes | None) -> None:
@@ -525,7 +533,8 @@ class FleetConnection(Generic[T]):
             self._refused("refuses the connection", packet.reason_code, properties, refused=True)
             return
         granted = self.granted = granted_by(self.settings, packet)
-        self.not_before = self._connecting.at
+        if not packet.session_present:
+            self._freshness.session_began(self._connecting.at)
         self._window = granted.window
         if granted.maximum_packet_size is not None:
             self._maximum_packet_size = granted.maximum_packet_size
@@ -572,7 +581,7 @@ class FleetConnection(Generic[T]):
             raise ProtocolError(ReasonCode.PROTOCOL_ERROR, "a PINGRESP without a PINGREQ")
         sent_at = self._pings.popleft().at
         self.round_trip = now - sent_at
-        self.not_before = sent_at
+        self._freshness.ping_answered(sent_at)
 
     def _on_suback(self, packet: Suback) -> Subscribed:
         request = self._requests.pop(packet.packet_id, None)
@@ -623,6 +632,7 @@ class FleetConnection(Generic[T]):
                 self._heard[topic_wire] = topic
         qos = first >> 1 & 3
         dup = first >= 0x38
+        not_before = self._freshness.left_after(qos)
         if qos and not self._expects(packet_id, qos, dup):
             return None
         return Arrived(
@@ -634,11 +644,12 @@ class FleetConnection(Generic[T]):
             packet_id,
             None,
             NO_PROPERTIES,
-            self.not_before,
+            not_before,
         )
 
     def _on_publish(self, packet: Publish) -> Arrived | None:
         packet_id = packet.packet_id or 0
+        not_before = self._freshness.left_after(packet.qos)
         if packet.qos and not self._expects(packet_id, packet.qos, packet.dup):
             return None
         return Arrived(
@@ -650,13 +661,15 @@ class FleetConnection(Generic[T]):
             packet_id,
             packet.properties or None,
             packet.passed_on,
-            self.not_before,
+            not_before,
         )
 
     def _expects(self, packet_id: int, qos: int, dup: bool) -> bool:
         """Note a QoS 1 or 2 message; False if it was received on this connection before."""
         is_new = self._receipts.expects(packet_id, qos, dup)
-        if not is_new and self._receipts.is_unreleased(packet_id):
+        if is_new:
+            self._freshness.message_received()
+        elif self._receipts.is_unreleased(packet_id):
             self._answer(0x50, packet_id, ReasonCode.SUCCESS)
         return is_new
 

@@ -49,7 +49,7 @@ class Arrived:
 
     `properties` are those but the User Properties; `properties_wire` has all that may be passed on,
     encoded, see `CheckedProperties`. `not_before` is a time of this computer before which it did
-    not leave the broker.
+    not leave the broker, nor, with QoS 1, was published there; minus infinity if there is none.
     """
 
     topic: str

@@ -11,6 +11,7 @@ from appliance.access import FileAccess, Rules
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Features, Limits, PeerStatus, Store
 from appliance.mqtt.codec import (
+    NO_PROPERTIES,
     V5,
     PacketType,
     Properties,
@@ -19,10 +20,11 @@ from appliance.mqtt.codec import (
     decode_properties,
     encode_properties,
 )
-from appliance.mqtt.packets import Publish
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream.answers import Answers
 from appliance.upstream.in_session import InCounters, InSession
+from appliance.upstream.late import Freshness
+from appliance.upstream.link_events import Arrived
 from appliance.upstream.out_session import OutSession
 from appliance.upstream.rules import LinkRules, OutRule
 
@@ -104,11 +106,13 @@ class FakeConnection:
         self.is_paused = False
         self.probes = 0
         self.silence = 0.0
+        self.on_acknowledged: Callable[[], None] = lambda: None
         self.session: InSession | None = None
 
     def acknowledge(self, packet_id: int, code: int) -> None:
         assert not self.closed
         self.acknowledged.append((packet_id, code))
+        self.on_acknowledged()
 
     def later(self, seconds: float) -> None:
         self.turn_in = seconds if self.turn_in is None else min(seconds, self.turn_in)
@@ -223,15 +227,29 @@ class Fleet:
             answering,
             self.connection,
             rig.counters,
-            connected_at=rig.now,
             **options,
         )
         self._packet_id = 0
+        #: As the link has it.
+        self.freshness = Freshness()
+        self._pings: list[float] = []
+        self.connection.on_acknowledged = self.freshness.message_acknowledged
+        if not options.get("is_kept"):
+            self.freshness.session_began(rig.now)
+
+    def ask(self, at: float | None = None) -> None:
+        """A PINGREQ."""
+        self._pings.append(self.rig.now if at is None else at)
+        self.freshness.ping_sent()
+
+    def answer(self) -> None:
+        """A PINGRESP."""
+        self.freshness.ping_answered(self._pings.pop(0))
 
     def ping(self) -> None:
         """A PINGREQ that is answered at once."""
-        self.session.freshness.ping_sent(self.rig.now)
-        self.session.freshness.ping_answered()
+        self.ask()
+        self.answer()
 
     def put(
         self,
@@ -241,17 +259,21 @@ class Fleet:
         retain: bool = False,
         dup: bool = False,
         properties: Properties | None = None,
-    ) -> int | None:
+    ) -> int:
         """A PUBLISH, without a flush; returns its packet id."""
-        packet_id = None
+        packet_id = 0
+        not_before = self.freshness.left_after(qos)
         if qos:
             packet_id = self._packet_id = self._packet_id + 1
-        packet = Publish(topic, payload, qos, retain, dup, packet_id)
+            self.freshness.message_received()
+        packet = Arrived(
+            topic, payload, qos, retain, dup, packet_id, None, NO_PROPERTIES, not_before
+        )
         if properties:
             wire = encode_properties(properties)
             checked, _ = check_properties(wire, 0, len(wire), PacketType.PUBLISH, 1000)
             assert checked is not None
-            packet.properties, packet.passed_on = checked.values, checked.passed_on
+            packet.properties, packet.properties_wire = checked.values, checked.passed_on
         self.session.receive(packet, self.rig.now)
         return packet_id
 
@@ -260,7 +282,7 @@ class Fleet:
         packet_id = self.put(topic, payload, qos, **how)  # type: ignore[arg-type]
         self.rig.broker.flush()
         codes = dict(self.connection.codes())
-        return codes.get(packet_id or 0, -1)
+        return codes.get(packet_id, -1)
 
     def turn(self, seconds: float = 0.0) -> None:
         """Take the turn that was asked for."""

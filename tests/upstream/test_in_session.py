@@ -214,13 +214,13 @@ def test_a_thousand_commands_that_are_late_reach_nobody(rig: Rig) -> None:
     fleet = rig.connect()
     sent_at = rig.now
     rig.now += 10
-    fleet.session.freshness.ping_sent(sent_at + 9.9)  # answered behind what was in flight
+    fleet.ask(sent_at + 9.9)  # answered behind what was in flight
     for number in range(1000):
         if number == LEAST_WINDOW:
-            fleet.session.freshness.ping_answered()
+            fleet.answer()
         fleet.put("fleet/r2/cmd_vel", qos=1)
         rig.broker.flush()
-    fleet.session.freshness.ping_sent(rig.now)
+    fleet.ask()
     for _ in range(1000):
         fleet.put("fleet/r2/cmd_vel", qos=1)
     assert not ear.came
@@ -228,7 +228,7 @@ def test_a_thousand_commands_that_are_late_reach_nobody(rig: Rig) -> None:
         fleet.turn()
     assert not ear.came and dropped(rig) == {("cmd_vel", "LATE"): 2000}
     assert len(fleet.connection.codes()) == 2000
-    fleet.session.freshness.ping_answered()
+    fleet.answer()
     fleet.ping()
     fleet.send("fleet/r2/cmd_vel")
     assert len(ear.came) == 1

@@ -78,50 +78,51 @@ def test_nothing_that_is_taken_is_older_than_the_rule_allows(
 def test_an_answered_ping_tells_the_age_of_what_comes_after_it() -> None:
     freshness = Freshness()
     assert freshness.left_after(0) == freshness.left_after(1) == -math.inf
-    freshness.ping_sent(1.0)
-    freshness.ping_sent(2.0)
+    freshness.ping_sent()
+    freshness.ping_sent()
     assert freshness.left_after(0) == -math.inf
-    freshness.ping_answered()
+    freshness.ping_answered(1.0)
     assert freshness.left_after(0) == freshness.left_after(1) == 1.0
-    freshness.ping_answered()
+    freshness.ping_answered(2.0)
     assert freshness.left_after(0) == freshness.left_after(1) == 2.0
-    freshness.ping_answered()  # nothing was asked
-    assert freshness.left_after(0) == 2.0
 
 
-def test_a_clean_session_has_nothing_from_before_its_connection() -> None:
-    freshness = Freshness(5.0)
+def test_a_new_session_has_nothing_from_before_its_connection() -> None:
+    freshness = Freshness()
+    freshness.session_began(5.0)
     assert freshness.left_after(0) == freshness.left_after(1) == 5.0
 
 
 def test_a_full_window_hides_the_age_of_what_waits_behind_it() -> None:
     """After a silence of the network a broker sends what was in flight, and then what waited."""
-    freshness = Freshness(0.0)
-    freshness.ping_sent(10.0)
+    freshness = Freshness()
+    freshness.session_began(0.0)
+    freshness.ping_sent()
     for _ in range(LEAST_WINDOW):  # what the broker had in flight before it answered
         freshness.message_received()
-    freshness.ping_answered()
+    freshness.ping_answered(10.0)
     assert freshness.left_after(0) == 10.0
     assert freshness.left_after(1) == 0.0  # the next one may have waited there since then
     for _ in range(LEAST_WINDOW):
         freshness.message_acknowledged()
-    freshness.ping_sent(11.0)
+    freshness.ping_sent()
     for _ in range(LEAST_WINDOW - 1):
         freshness.message_received()
-    freshness.ping_answered()
+    freshness.ping_answered(11.0)
     assert freshness.left_after(1) == 11.0
 
 
 def test_what_is_unacknowledged_here_may_fill_the_window_there() -> None:
-    freshness = Freshness(0.0)
+    freshness = Freshness()
+    freshness.session_began(0.0)
     for _ in range(LEAST_WINDOW):
         freshness.message_received()
-    freshness.ping_sent(1.0)
-    freshness.ping_answered()
+    freshness.ping_sent()
+    freshness.ping_answered(1.0)
     assert freshness.left_after(1) == 0.0
     freshness.message_acknowledged()
-    freshness.ping_sent(2.0)
-    freshness.ping_answered()
+    freshness.ping_sent()
+    freshness.ping_answered(2.0)
     assert freshness.left_after(1) == 2.0
 
 
@@ -157,8 +158,10 @@ def test_no_message_is_older_than_it_is_taken_for() -> None:
 
 def _play(random_: random.Random) -> int:
     """Returns of how many messages it was known that they are younger than two seconds."""
-    server, freshness = Server(random_.randint(LEAST_WINDOW, 30)), Freshness(0.0)
+    server, freshness = Server(random_.randint(LEAST_WINDOW, 30)), Freshness()
+    freshness.session_began(0.0)
     to_server: list[str] = []
+    pings: list[float] = []
     unacknowledged, now, known = 0, 0.0, 0
     for _ in range(1500):
         now += random_.random() * 0.1
@@ -178,7 +181,7 @@ def _play(random_: random.Random) -> int:
             came, server.line = server.line[:count], server.line[count:]
             for published_at in came:
                 if published_at is None:
-                    freshness.ping_answered()
+                    freshness.ping_answered(pings.pop(0))
                     continue
                 left_after = freshness.left_after(1)
                 freshness.message_received()
@@ -191,6 +194,7 @@ def _play(random_: random.Random) -> int:
                 freshness.message_acknowledged()
                 to_server.append("ack")
         else:
-            freshness.ping_sent(now)
+            freshness.ping_sent()
+            pings.append(now)
             to_server.append("ping")
     return known

@@ -51,6 +51,7 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ReasonCode
 from appliance.store import MemoryStore
 from appliance.upstream.agreement import ConnectSettings, EndedBy
+from appliance.upstream.late import LEAST_WINDOW
 from appliance.upstream.link import (
     CACHED,
     LONGEST_CACHED,
@@ -927,6 +928,36 @@ def test_several_pings_bound_the_age_of_what_arrives():
     fake.sent()
     fake.say(Pingresp(), Pingresp())
     assert not_before() == 103.0
+
+
+def test_a_ping_bounds_the_age_of_messages_that_wait_for_acknowledgements_only_if_none_can():
+    """A broker that has as many in flight as it may sends the rest behind its PINGRESP."""
+    fake = Fake().open()
+    fake.now = 101.0
+    fake.link.ping()
+    fake.sent()
+    some = [Publish("a", b"", 1, packet_id=number) for number in range(1, LEAST_WINDOW + 1)]
+    fake.say(*some, Pingresp(), Publish("a", b"", 1, packet_id=99), Publish("a", b""))
+    *_, one, none = fake.heard()
+    assert isinstance(one, Arrived) and isinstance(none, Arrived)
+    assert (one.not_before, none.not_before) == (100.0, 101.0)
+    for message in (*some, one):
+        fake.link.acknowledge(message.packet_id or 0)
+    fake.now = 102.0
+    fake.link.ping()
+    fake.sent()
+    fake.say(Pingresp(), Publish("a", b"", 1, packet_id=1))
+    (one,) = fake.heard()
+    assert isinstance(one, Arrived) and one.not_before == 102.0
+
+
+def test_what_a_kept_session_held_is_of_unknown_age():
+    fake = Fake(clean_start=False, session_expiry=100)
+    fake.start()
+    fake.say(Connack(True), Publish("a", b"", 1, packet_id=1), Publish("a", b""))
+    _, one, none = fake.heard()
+    assert isinstance(one, Arrived) and isinstance(none, Arrived)
+    assert one.not_before == none.not_before == -math.inf
 
 
 def test_a_pingresp_for_a_ping_that_was_not_sent_yet():

@@ -22,6 +22,7 @@ from appliance.ops.init import call_topics
 from appliance.upstream.answers import new_token
 from appliance.upstream.limits import KINDS, kind_of_host
 from appliance.upstream.rules import InRule, UpstreamSettings
+from appliance.upstream.sessions import in_client_id, out_client_id
 from appliance.upstream.settings import command_filters
 from appliance.upstream.settings import upstreams as links
 
@@ -196,8 +197,8 @@ def _too_long(link: UpstreamSettings) -> Iterator[Finding]:
 
 def _rights(settings: Settings, link: UpstreamSettings, acl: Acl) -> Iterator[Finding]:
     """The lines that the access rules lack for what the link is to carry."""
-    reader = Identity(link.user, f"_upstream/{link.name}")
-    writer = Identity(link.user, f"_upstream/{link.name}/in")
+    reader = Identity(link.user, out_client_id(link.name))
+    writer = Identity(link.user, in_client_id(link.name))
     lacking = [
         (f"out {rule.topic}", "read", rule.local_filter)
         for rule in link.out
