@@ -424,7 +424,8 @@ class FleetConnection(Generic[T]):
     def tick(self, now: float, unsent: int = 0) -> float:
         """Send a PINGREQ if one is due, or end a connection that is silent; when it is due next.
 
-        `unsent` are the taken bytes that the network has not taken yet.
+        `unsent` are the taken bytes that the network has not taken yet. It is also to be called
+        after a `take` that returned something: what was sent has deadlines of its own.
         """
         if self.ended is not None or not (self._taken or self._out):
             return math.inf
@@ -443,7 +444,7 @@ class FleetConnection(Generic[T]):
         """End a connection on which something has no answer; when that would be next."""
         due = math.inf
         if self._left < self._taken:
-            due = self._left_at + PATIENCE
+            due = max(self._left_at, self._held_up_at) + PATIENCE
             if due <= now:
                 self._give_up(f"the broker has read nothing for {PATIENCE:.0f} s")
                 return due

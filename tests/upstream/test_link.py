@@ -460,6 +460,9 @@ def test_packet_identifiers_are_free_ones():
     fake.link.publish("3", "a", b"")
     fake.link.unsubscribe(["a"])
     assert [packet.packet_id for packet in fake.sent()] == [3, 4]  # type: ignore[union-attr]
+    fake.say(Puback(3))
+    fake.link.publish("4", "a", b"")  # not the one that was free last
+    assert [packet.packet_id for packet in fake.sent()] == [5]  # type: ignore[union-attr]
 
 
 def test_nothing_is_published_before_connack_or_after_the_end():
@@ -896,6 +899,11 @@ def test_a_process_that_was_held_up_does_not_blame_the_broker():
     assert fake.link.ended is None
     fake.say(Pingresp())
     fake.tick(1)
+    assert fake.link.ended is None
+    fake.link.publish("t", "a", bytes(1000))
+    fake.link.take(fake.now)
+    fake.tick(0, 500)
+    fake.tick(60, 500)
     assert fake.link.ended is None
 
 
