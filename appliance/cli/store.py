@@ -11,12 +11,15 @@ from appliance.cli.console import CommandError, ConfigOption, load, print_table,
 
 HEAD = ("CLIENT ID", "USER", "SUBSCRIPTIONS", "MESSAGES", "BYTES", "OLDEST", "ENDS")
 
+UPSTREAM_HEAD = ("UPSTREAM", "LANE", "MESSAGES", "BYTES", "OLDEST")
+
 store_app = typer.Typer(help="Sessions and messages that outlive a restart.")
 
 
 @store_app.callback(invoke_without_command=True)
 def store_show(context: typer.Context, config: ConfigOption = None) -> None:
-    """Show what outlives a restart: sessions, their queued messages, retained messages."""
+    """Show what outlives a restart: sessions, their queued messages, retained messages, and what
+    waits for upstreams."""
     if context.invoked_subcommand is not None:
         return
     path, _ = _store_path(config)
@@ -49,6 +52,13 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
     if rows:
         print_table([HEAD, *rows])
         typer.echo()
+    waiting = [
+        (each.link, str(each.lane), str(each.messages), str(each.size), when(each.oldest))
+        for each in summary.backlogs
+    ]
+    if waiting:
+        print_table([UPSTREAM_HEAD, *waiting])
+        typer.echo()
     typer.echo(
         f"{len(summary.sessions)} sessions, {summary.retained} retained messages of "
         f"{summary.retained_size} bytes; all {summary.messages} messages have "
@@ -58,7 +68,7 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
 
 @store_app.command("export")
 def store_export(config: ConfigOption = None) -> None:
-    """Print all of it as JSON, one session or retained message per line."""
+    """Print all of it as JSON, one session, retained message or upstream per line."""
     path, _ = _store_path(config)
     from appliance.ops.logs import json_text
     from appliance.store import StoreError
@@ -87,22 +97,27 @@ def store_prune(
         list[str] | None,
         typer.Option(metavar="FILTER", help="Retained messages: r2d2/old, or r2d2/#. Repeatable."),
     ] = None,
+    upstream: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="All that waits for this upstream. Repeatable."),
+    ] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Delete sessions, messages queued for too long, or retained messages, while the appliance is
-    stopped.
+    """Delete sessions, messages queued for too long, retained messages, or what waits for an
+    upstream, while the appliance is stopped.
 
     The appliance itself deletes retained messages of removed routes.
     """
-    if older_than is None and not client and not retained:
-        raise typer.BadParameter("say what: --older-than, --client, both, or --retained")
+    if older_than is None and not client and not retained and not upstream:
+        text = "say what: --older-than, --client, both, --retained, or --upstream"
+        raise typer.BadParameter(text)
     path, file = _store_path(config)
     import sqlite3
 
     from appliance.config import parse_duration
     from appliance.host.owners import OwnerError, acting_for
     from appliance.store import StoreError
-    from appliance.store.inspection import prune, prune_retained
+    from appliance.store.inspection import prune, prune_retained, prune_upstream
 
     try:
         age = None if older_than is None else parse_duration(older_than)
@@ -113,6 +128,9 @@ def store_prune(
             if retained:
                 count = prune_retained(path, retained)
                 typer.echo(f"{count} retained messages deleted")
+            for link in upstream or []:
+                count = prune_upstream(path, link)
+                typer.echo(f"{count} messages for {link} deleted")
             if age is not None or client:
                 sessions, messages = prune(path, age, client or [])
                 typer.echo(f"{sessions} sessions and {messages} messages deleted")

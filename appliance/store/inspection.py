@@ -16,6 +16,7 @@ from typing import TypeVar, cast
 from appliance.mqtt.topics import check_filter, matches
 from appliance.store import database
 from appliance.store.clock import Clocks, boot_id, stamp_of
+from appliance.store.loader import load
 from appliance.store.rows import OwedRow, ReceivedRow, Rows, SubscriptionRow, Table, Value
 from appliance.store.schema import (
     DamagedError,
@@ -46,6 +47,20 @@ class SessionSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class BacklogSummary:
+    """What waits for a link to another broker, in one of its lanes.
+
+    The size in bytes is that of whole segments; `oldest` is by the wall clock.
+    """
+
+    link: str
+    lane: int
+    messages: int
+    size: int
+    oldest: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Summary:
     """What is stored; sizes in bytes."""
 
@@ -55,6 +70,7 @@ class Summary:
     retained: int
     retained_size: int
     file_size: int
+    backlogs: list[BacklogSummary]
 
 
 def _require(path: Path) -> None:
@@ -118,7 +134,22 @@ def summarise(path: Path) -> Summary:
         len(rows.retained),
         sum(payload_size(row.message) for row in rows.retained.values()),
         database.size_on_disk(path),
+        _backlogs(rows),
     )
+
+
+def _backlogs(rows: Rows) -> list[BacklogSummary]:
+    loaded = load(rows, 0.0).backlogs
+    to_date = _wall_clock(rows)
+    return [
+        BacklogSummary(
+            *place,
+            sum(segment.count - segment.done for segment in segments),
+            sum(segment.size for segment in segments),
+            to_date(min(segment.first_at for segment in segments)),
+        )
+        for place, segments in sorted(loaded.segments.items())
+    ]
 
 
 def _wall_clock(rows: Rows) -> Callable[[Value], float | None]:
@@ -137,7 +168,7 @@ def _by_session(rows: dict[int, _OfSession]) -> defaultdict[Value, list[_OfSessi
 
 
 def export(path: Path) -> Iterator[dict[str, object]]:
-    """Every session and every retained message as plain values for JSON. Raises StoreError."""
+    """Sessions, retained messages and what backlogs have, as values for JSON. Raises StoreError."""
     rows = read(path)
     to_date = _wall_clock(rows)
 
@@ -187,6 +218,14 @@ def export(path: Path) -> Iterator[dict[str, object]]:
         }
     for row in rows.retained.values():
         yield {"retained": message(row.message)}
+    for backlog in _backlogs(rows):
+        yield {
+            "upstream": backlog.link,
+            "lane": backlog.lane,
+            "messages": backlog.messages,
+            "bytes": backlog.size,
+            "oldest": backlog.oldest,
+        }
 
 
 def _now(rows: Rows) -> float:
@@ -213,6 +252,28 @@ def prune_retained(path: Path, filters: list[str]) -> int:
             if any(matches(each, topic) for each in filters):
                 batch.remove(Table.RETAINED, key)
         return len(batch.deleted[Table.RETAINED])
+
+
+def prune_upstream(path: Path, link: str) -> int:
+    """Delete all that waits for a link to another broker; returns how many messages.
+
+    Raises:
+        StoreError: an appliance is running, or there is no database, or nothing of that link.
+        sqlite3.Error, OSError: it cannot be written.
+    """
+    with _changing(path) as (rows, batch):
+        found = [backlog for backlog in _backlogs(rows) if backlog.link == link]
+        for key, row in rows.segment.items():
+            if row.link == link:
+                batch.remove(Table.SEGMENT, key)
+                batch.remove_records(key)
+        for key, latest in rows.latest.items():
+            if latest.link == link:
+                batch.remove(Table.LATEST, key)
+        if not batch:
+            raise StoreError(f"nothing waits for an upstream {link!r}")
+        waiting = sum(backlog.messages for backlog in found)
+        return waiting + len(batch.deleted[Table.LATEST])
 
 
 @contextlib.contextmanager

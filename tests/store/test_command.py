@@ -84,6 +84,8 @@ def test_it_is_pruned_when_the_appliance_is_stopped(process: ApplianceProcess) -
     assert "1 sessions and 0 messages" in store(process, "prune", "--client", "first").stdout
     assert set(entries(process)) == {"second"}
     assert store(process, "prune").returncode == 2
+    nothing = store(process, "prune", "--upstream", "fleet")
+    assert nothing.returncode == 1 and "nothing waits for an upstream 'fleet'" in nothing.stderr
     assert store(process, "prune", "--retained", "r2d2/#/x").returncode == 2
     assert "0 retained" in store(process, "prune", "--retained", "elsewhere/#").stdout
     assert "1 retained messages deleted" in store(process, "prune", "--retained", "+/a").stdout

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 import sqlite3
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ import pytest_asyncio
 from waiting import until
 
 from appliance.broker.ports import SEGMENT_SIZE, Journal, RecordsLostError, Segment
-from appliance.store import committer
+from appliance.net.callbacks import Entries
+from appliance.store import StoreError, committer
 from appliance.store import journal as journal_module
+from appliance.store.inspection import export, prune_upstream, summarise
 from appliance.store.journal import SMALL
 from store.harness import Harness
 
@@ -318,6 +321,64 @@ async def _all_written(harness: Harness) -> None:
     while harness.store.failing or not harness.store._committer.is_idle:
         await harness.written()
         await asyncio.sleep(0.001)
+
+
+@pytest.mark.parametrize("is_committed", [True, False])
+async def test_a_fault_before_records_are_taken_is_an_outcome(
+    harness: Harness, escaped: list[str], monkeypatch: pytest.MonkeyPatch, is_committed: bool
+) -> None:
+    """Or what waits for the records would wait for ever."""
+    journal = opened(harness)
+    segment = journal.append(b"record")
+    if is_committed:
+        await harness.written()
+    own, faults = Entries.run, harness.broker.faults
+
+    def run(self: Entries, entry: str, *args: Any) -> None:
+        if entry == "store.read" and not faults.count:
+
+            def fails(*args: object) -> None:
+                raise AssertionError(entry)
+
+            own(self, entry, args[0], args[1], fails, ())
+        else:
+            own(self, entry, *args)
+
+    monkeypatch.setattr(Entries, "run", run)
+    outcomes = [await read(journal, segment) for _ in range(5)]
+    assert isinstance(outcomes[0], RuntimeError)
+    assert outcomes[1:] == [[b"record"]] * 4
+    assert faults.by_entry == {"store.read": 1}
+    assert harness.store.backlogs._reader is not None
+    assert harness.store.backlogs._reader._running == 0
+    escaped.clear()
+
+
+async def test_what_waits_is_shown_and_pruned(harness: Harness) -> None:
+    for lane in range(2):
+        for number in range(10):
+            segment = opened(harness, lane=lane).append(bytes(number))
+    opened(harness, lane=1).settle(segment, 3)
+    harness.store.backlogs.latest("fleet").put(None, b"latest")
+    opened(harness, "other").append(b"x")
+    await harness.written()
+    shown = summarise(harness.path)
+    waiting = [(each.link, each.lane, each.messages, each.size) for each in shown.backlogs]
+    assert waiting == [("fleet", 0, 10, 45), ("fleet", 1, 7, 45), ("other", 0, 1, 1)]
+    assert all(abs((each.oldest or 0) - time.time()) < 100 for each in shown.backlogs)
+    exported = [line for line in export(harness.path) if "upstream" in line]
+    assert [(each["upstream"], each["messages"]) for each in exported] == [
+        *(("fleet", 10), ("fleet", 7), ("other", 1))
+    ]
+    with pytest.raises(StoreError, match="stop the appliance"):
+        prune_upstream(harness.path, "fleet")
+    await harness.stop()
+    assert prune_upstream(harness.path, "fleet") == 18
+    with pytest.raises(StoreError, match="nothing waits for an upstream 'fleet'"):
+        prune_upstream(harness.path, "fleet")
+    harness.start()
+    assert harness.store.backlogs.links() == ["other"]
+    assert await unsettled(opened(harness, "other")) == [b"x"]
 
 
 class Twin:
