@@ -25,6 +25,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -64,6 +65,7 @@ class _End(asyncio.Protocol):
     def __init__(self) -> None:
         self.out: _Pipe  # what comes from here
         self.into: _Pipe  # what goes there
+        self.ended_at: list[float] = []
         self.open = False
         self.writable = True
 
@@ -81,6 +83,7 @@ class _End(asyncio.Protocol):
 
     def connection_lost(self, error: Exception | None) -> None:
         self.open = False
+        self.ended_at.append(time.monotonic())
         if error is not None or not self.out.fin:
             self.out.feed(None)
         self.into.discard()
@@ -215,7 +218,10 @@ class _Pipe:
 class _Connection:
     """A client's connection, and the one to the broker that belongs to it."""
 
-    def __init__(self, near: _End, far: _End, up: Way, down: Way, capacity: int) -> None:
+    def __init__(
+        self, near: _End, far: _End, up: Way, down: Way, capacity: int, ended_at: list[float]
+    ) -> None:
+        near.ended_at = far.ended_at = ended_at
         self.near = near
         self.far = far
         self.up = near.out = far.into = _Pipe(up, near, far, capacity)
@@ -258,6 +264,8 @@ class Relay:
         self.down = Way()
         self.port = 0
         self.accepted = 0
+        #: When a connection has ended, at either end; by `time.monotonic`, ascending.
+        self.ended_at: list[float] = []
         self._capacity = capacity
         self._socket_buffer = socket_buffer
         self._connections: list[_Connection] = []
@@ -392,7 +400,7 @@ class Relay:
 
     def _begin(self, near: _End) -> None:
         far = _End()
-        connection = _Connection(near, far, self.up, self.down, self._capacity)
+        connection = _Connection(near, far, self.up, self.down, self._capacity, self.ended_at)
         near.transport.pause_reading()  # until there is somebody to read for
         connection.up._paused = True
         self._connections = [each for each in self._connections if each.open]

@@ -172,8 +172,11 @@ async def test_a_new_connection_reaches_nobody_while_silent(relay, server, dial)
 async def test_reset_is_a_rst_on_both_sides(relay, server, dial) -> None:
     client = await dial()
     relay.reset()
+    began = time.monotonic()
     await until(lambda: client.end == "RST" and server.ends == ["RST"])
     assert relay.connections == 0
+    assert all(began - 1 < when <= time.monotonic() for when in relay.ended_at)
+    assert len(relay.ended_at) == 2
     again = await dial()
     again.writer.write(b"works")
     await until(lambda: server.received == b"works")

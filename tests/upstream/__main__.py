@@ -1,0 +1,119 @@
+"""The link to a fleet's broker, for as long as you like::
+
+    python tests/upstream --kills 200                     # mosquitto behind a bad line
+    python tests/upstream --kills 50 --fleet rabbitmq --both
+    python tests/upstream --kills 50 --fleet appliance --both
+    python tests/upstream --outage                        # 8 h at 1 kHz, scaled 1:10, into 64 MiB
+    python tests/upstream --outage --size "1 GiB" --messages 9000000 --restarts
+    python tests/upstream --late
+    python tests/upstream --calls 10000
+    python tests/upstream --faults 10
+
+The exit code is 1 when anything is wrong, 2 when a program is missing. The seed that is printed
+determines what is done, but not its timing. With `--device mosquitto` mosquitto's bridge is tried
+in place of the appliance, which shows that the programs find what is lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from upstream.calls import Calls
+from upstream.faults import Faults
+from upstream.kills import FLEETS, Kills
+from upstream.late_commands import LateCommands
+from upstream.outage import Outage
+
+#: Problems that are told in full.
+SHOWN = 20
+
+#: What is tried.
+DEVICES = ("appliance", "mosquitto", "mosquitto311")
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python tests/upstream",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--kills", type=int, metavar="N", help="kill at random so often, under load")
+    what.add_argument("--outage", action="store_true", help="fill the backlog, then drain it")
+    what.add_argument("--faults", type=float, metavar="MINUTES", help="random faults of the line")
+    what.add_argument("--late", action="store_true", help="commands over a line that is silent")
+    what.add_argument("--calls", type=int, metavar="N", help="calls from the fleet")
+    parser.add_argument("--seed", type=int, default=secrets.randbits(32))
+    parser.add_argument("--device", choices=DEVICES, default="appliance")
+    kills = parser.add_argument_group("with --kills")
+    kills.add_argument("--fleet", choices=FLEETS, default="mosquitto")
+    who = kills.add_mutually_exclusive_group()
+    who.add_argument("--both", action="store_true", help="kill the fleet's broker, too")
+    who.add_argument("--nobody", action="store_true", help="only cut the line")
+    outage = parser.add_argument_group("with --outage")
+    outage.add_argument("--messages", type=int, default=2_880_000, help="(default: 2,880,000)")
+    outage.add_argument("--payload", type=int, default=100, help="bytes (default: 100)")
+    outage.add_argument("--size", default="64 MiB", help="of the backlog (default: 64 MiB)")
+    outage.add_argument("--rate", type=float, help="messages a second (default: what it takes)")
+    outage.add_argument(
+        "--restarts", action="store_true", help="kill it with all that waiting: CONNECT within 1 s"
+    )
+    outage.add_argument("--queue", type=int, default=0, help="messages of mosquitto's bridge")
+    late = parser.add_argument_group("with --late")
+    late.add_argument("--silence", type=float, default=10.0, help="seconds (default: 10)")
+    return parser.parse_args(arguments)
+
+
+def program(options: argparse.Namespace, directory: Path, say: Callable[[str], None]) -> Any:
+    """What is to be run: `run()` returns its report."""
+    common: dict[str, Any] = {"device": options.device, "say": say}
+    if options.kills is not None:
+        victims = "both" if options.both else "nobody" if options.nobody else "device"
+        kills = Kills(directory, options.seed, fleet=options.fleet, victims=victims, **common)
+        return lambda: kills.run(options.kills)
+    if options.outage:
+        return Outage(
+            directory,
+            messages=options.messages,
+            payload=options.payload,
+            size=options.size,
+            rate=options.rate,
+            restarts=options.restarts,
+            queue=options.queue,
+            **common,
+        ).run
+    if options.faults is not None:
+        return Faults(directory, options.seed, seconds=options.faults * 60, **common).run
+    if options.late:
+        return LateCommands(directory, silence=options.silence, **common).run
+    return Calls(directory, count=options.calls, **common).run
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = parse(arguments)
+    print(f"seed {options.seed}", flush=True)
+    with tempfile.TemporaryDirectory(prefix="upstream-") as directory:
+        try:
+            run = program(options, Path(directory), lambda line: print(line, flush=True))
+            report = run()
+        except pytest.skip.Exception as missing:
+            print(missing)
+            return 2
+    for problem in report.problems[:SHOWN]:
+        print(problem)
+    print(report)
+    return 1 if report.problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

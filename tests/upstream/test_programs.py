@@ -1,0 +1,70 @@
+"""`python tests/upstream` finds what mosquitto's bridge loses, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from upstream import __main__ as program
+from upstream import calls, kills, late_commands, outage
+from upstream.calls import Calls
+from upstream.device import count
+from upstream.kills import Kills
+from upstream.late_commands import LateCommands
+from upstream.outage import Outage
+
+
+def test_a_line_that_is_cut_loses_nothing_with_the_bridge_of_3_1_1(tmp_path: Path) -> None:
+    report = Kills(tmp_path, 1, device="mosquitto311", victims="nobody").run(2)
+    assert not report.problems, "\n".join(report.problems)
+    assert report.cuts == 2 and report.acknowledged > 50
+
+
+def test_kills_that_lose_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """mosquitto acknowledges before it has stored."""
+    monkeypatch.setattr(kills, "STALLED", 2.5)
+    report = Kills(tmp_path, 1, device="mosquitto311").run(4)
+    assert any("LOST" in each for each in report.problems), report
+    assert report.kills == 4
+
+
+def test_an_outage_that_drops_the_newest_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outage, "STALLED", 4.0)
+    report = Outage(tmp_path, device="mosquitto", messages=3000, queue=100).run()
+    assert "are missing behind the oldest kept" in report.problems[0]  # it keeps the oldest
+    assert any("state/" in each for each in report.problems), "all of a topic are not the latest"
+
+
+def test_late_commands_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(late_commands, "OFFLINE", 100)
+    monkeypatch.setattr(late_commands, "STEADY", 0.5)
+    monkeypatch.setattr(late_commands, "SETTLING", 0.5)
+    report = LateCommands(tmp_path, device="mosquitto311", silence=1.5, rounds=1).run()
+    assert "LATE" in report.problems[0] and "while the link was away CAME" in report.problems[1]
+
+
+def test_calls_without_an_answer_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calls, "PATIENCE", 2.0)
+    report = Calls(tmp_path, device="mosquitto311", count=10, others=0).run()
+    assert report.calls == 10 and "UNANSWERED" in report.problems[0]
+
+
+def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for arguments in (["--kills", "2"], ["--outage"], ["--late"], ["--calls", "5"]):
+        assert program.program(program.parse(arguments), tmp_path / arguments[0], print)
+    with pytest.raises(SystemExit):
+        program.parse([])
+    with pytest.raises(SystemExit):
+        program.parse(["--help"])
+    assert "--outage" in capsys.readouterr().out
+
+
+def test_what_a_status_counts() -> None:
+    assert count(None, "dropped") is None
+    assert count({"dropped": 3}, "dropped") == 3
+    assert (
+        count({"dropped": {"events/#": 2, "state/#": {"messages": 5, "bytes": 70}}}, "dropped") == 7
+    )
