@@ -20,13 +20,13 @@ from appliance.broker.ports import LOCAL_PEER, PublishRejection
 from appliance.broker.session import Session
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.node import BusError
-from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.converter import ConversionError
 from appliance.ros.payload.payloads import unpacked_size
 from appliance.ros.topics.conversions import LITTLE, size_of
 from appliance.ros.topics.flow import LOG_INTERVAL
+from appliance.ros.topics.follower import RoutedTopic
 from appliance.ros.topics.lease import OVERTAKEN, Lease
 from appliance.ros.topics.publication import CommandPublicationFollower, Outlet
-from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.rules import CommandRules
 from appliance.ros.topics.staleness import (
     QUEUED,
@@ -105,17 +105,10 @@ class Commands(ToRos):
 
     _follower_type = CommandPublicationFollower
 
-    def __init__(
-        self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
-        context: ToRosContext,
-    ) -> None:
-        super().__init__(route, ros, converters, log, context)
-        assert route.settings.rules is not None
-        self.rules: CommandRules = route.settings.rules
+    def __init__(self, topic: RoutedTopic, context: ToRosContext) -> None:
+        super().__init__(topic, context)
+        assert self.settings.rules is not None
+        self.rules: CommandRules = self.settings.rules
         #: The client that sent the last command, and when.
         self._source: Session | None = None
         self._commanded_at = -math.inf

@@ -9,6 +9,7 @@ from appliance.broker.message import Message
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.payload.converter import Converters
 from appliance.ros.topics.commands import Commands
+from appliance.ros.topics.follower import RoutedTopic
 from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import ToRos, ToRosContext
@@ -29,9 +30,12 @@ class FlowFactory:
 
     def to_mqtt(self, route: BridgeRoute, ros: str) -> ToMqtt:
         """A flow from a ROS topic to MQTT."""
-        return ToMqtt(route, ros, self.converters, self.log, self.mailbox, self.publish)
+        return ToMqtt(self._topic(route, ros), self.mailbox, self.publish)
 
     def to_ros(self, route: BridgeRoute, ros: str) -> ToRos:
         """A flow from MQTT to a ROS topic, with the route's command rules if it has some."""
         flow_type = ToRos if route.settings.rules is None else Commands
-        return flow_type(route, ros, self.converters, self.log, self.context)
+        return flow_type(self._topic(route, ros), self.context)
+
+    def _topic(self, route: BridgeRoute, ros: str) -> RoutedTopic:
+        return RoutedTopic(route, ros, self.converters, self.log)

@@ -52,6 +52,16 @@ class TopicState:
         return [Skipped(ros, direction, topic.settings.type or "", "absent", topic.absence)]
 
 
+@dataclass(frozen=True, slots=True)
+class RoutedTopic:
+    """A ROS topic of a route, and what its flow converts and logs with."""
+
+    route: BridgeRoute
+    ros: str
+    converters: Converters
+    log: LogFunction
+
+
 class TopicFollower(ABC):
     """Follows one ROS topic for one direction.
 
@@ -63,17 +73,11 @@ class TopicFollower(ABC):
     #: Why a topic that a route names is not carried yet.
     absence: ClassVar[str]
 
-    def __init__(
-        self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
-    ) -> None:
-        self.route = route
+    def __init__(self, topic: RoutedTopic) -> None:
+        self.route = route = topic.route
         self.settings = settings = route.settings
-        self.ros = ros
-        self.mqtt = settings.mqtt.replace("{ros}", ros)
+        self.ros = topic.ros
+        self.mqtt = settings.mqtt.replace("{ros}", topic.ros)
         #: What the ROS thread has counted; the loop's thread adds it to its own.
         self.counters = ReceiveCounters()
         self.state = TopicState()
@@ -82,8 +86,8 @@ class TopicFollower(ABC):
         self.number = next(_NUMBERS)
         #: Whether a pattern found the topic: then it is bridged while other nodes have endpoints.
         self.is_matched = route.is_pattern
-        self._converters = converters
-        self._log = log
+        self._converters = topic.converters
+        self._log = topic.log
         self._count: tuple[int, int] | None = None
         #: Type, QoS and type hash that were last opened, or failed to be.
         self._opened_for: tuple[str, QosProfile, str | None] | None = None

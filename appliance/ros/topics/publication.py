@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from appliance.ros.node import Endpoint, QosProfile, RosNode, RosPublisher
-from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.payloads import unpacker
 from appliance.ros.qos import publisher_qos
 from appliance.ros.topics.echo import EchoFilter
-from appliance.ros.topics.follower import TopicFollower
-from appliance.ros.topics.route import BridgeRoute, LogFunction
+from appliance.ros.topics.follower import RoutedTopic, TopicFollower
 from appliance.ros.topics.rules import CommandRules, FieldLimits
 from appliance.ros.topics.stop_message import StopMessage, check_rules
 
@@ -69,16 +67,10 @@ class PublicationFollower(TopicFollower):
     absence = "no node subscribes to it, which would tell its type; the route can name it"
 
     def __init__(
-        self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
-        listener: PublicationListener,
-        post: Callable[..., None],
+        self, topic: RoutedTopic, listener: PublicationListener, post: Callable[..., None]
     ) -> None:
         """`post` calls on the loop's thread."""
-        super().__init__(route, ros, converters, log)
+        super().__init__(topic)
         self.publication = Publication()
         # The flow owns this follower. Only the garbage collector would free a cycle of the two, and
         # it never looks at old objects (`app/main.py`).
@@ -86,7 +78,7 @@ class PublicationFollower(TopicFollower):
         self._post = post
         self._limits: FieldLimits | None = None
         #: The topic's name on ROS, where a remapping gives it another.
-        self._name = ros
+        self._name = topic.ros
 
     def __str__(self) -> str:
         return f"{self.mqtt} → {self.ros}"
@@ -143,17 +135,11 @@ class CommandPublicationFollower(PublicationFollower):
     """The same for a route with command rules, which depend on the type."""
 
     def __init__(
-        self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
-        listener: PublicationListener,
-        post: Callable[..., None],
+        self, topic: RoutedTopic, listener: PublicationListener, post: Callable[..., None]
     ) -> None:
-        super().__init__(route, ros, converters, log, listener, post)
-        assert route.settings.rules is not None
-        self._rules: CommandRules = route.settings.rules
+        super().__init__(topic, listener, post)
+        assert self.settings.rules is not None
+        self._rules: CommandRules = self.settings.rules
         #: Polls that have found a subscription since this publisher was made.
         self._polls = 0
 

@@ -17,14 +17,14 @@ from appliance.mqtt.codec import Properties, encode_property_list, encode_string
 from appliance.ros.mailbox import LARGE, Lane, Mailbox
 from appliance.ros.metrics import FlowCounters, ReceiveCounters
 from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription, TakeBatch
-from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.converter import ConversionError
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.payloads import packer
 from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
 from appliance.ros.topics.echo import EchoFilter
 from appliance.ros.topics.flow import Flow, ProblemLog
-from appliance.ros.topics.follower import TopicFollower
-from appliance.ros.topics.route import BridgeRoute, LogFunction
+from appliance.ros.topics.follower import RoutedTopic, TopicFollower
+from appliance.ros.topics.route import BridgeRoute
 from appliance.ros.topics.transforms import TYPES, StaticTransforms
 
 #: Seconds without a message after which a topic with a byte budget counts as silent.
@@ -209,20 +209,13 @@ class SubscriptionFollower(TopicFollower):
     absence = "no node publishes it"
 
     def __init__(
-        self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
-        mailbox: Mailbox,
-        lane: Lane,
-        on_batch: TakeBatch,
+        self, topic: RoutedTopic, mailbox: Mailbox, lane: Lane, on_batch: TakeBatch
     ) -> None:
         """`on_batch`, a method of the flow, takes messages on the loop's thread."""
-        super().__init__(route, ros, converters, log)
+        super().__init__(topic)
         self.intake = Intake(packer(None, "cdr", "none", []))
-        problems = ProblemLog(str(self), log)
-        self.messages = RosMessages(route, self.mqtt, lane, mailbox, self.counters, problems)
+        problems = ProblemLog(str(self), topic.log)
+        self.messages = RosMessages(self.route, self.mqtt, lane, mailbox, self.counters, problems)
         self._mailbox = mailbox
         self._lane = lane
         # The flow owns this follower. Only the garbage collector would free a cycle of the two, and
@@ -321,18 +314,15 @@ class ToMqtt(Flow):
 
     def __init__(
         self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
+        topic: RoutedTopic,
         mailbox: Mailbox,
         publish: Callable[[Iterable[tuple[Lane, Message]]], None],
     ) -> None:
         """`publish` publishes messages that were received on the loop's thread."""
         counters = FlowCounters()
-        self._lane = lane = Lane(route.settings.samples, counters)
-        follower = SubscriptionFollower(route, ros, converters, log, mailbox, lane, self.on_batch)
-        super().__init__(follower, log, counters)
+        self._lane = lane = Lane(topic.route.settings.samples, counters)
+        follower = SubscriptionFollower(topic, mailbox, lane, self.on_batch)
+        super().__init__(follower, topic.log, counters)
         self.follower = follower
         self._messages = follower.messages
         self._mailbox = mailbox

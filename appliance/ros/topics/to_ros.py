@@ -16,14 +16,14 @@ from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries
 from appliance.ros.metrics import FlowCounters
 from appliance.ros.node import BusError
-from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.converter import ConversionError
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.payloads import user_property
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
 from appliance.ros.topics.flow import Flow, ProblemLog
+from appliance.ros.topics.follower import RoutedTopic
 from appliance.ros.topics.lease import OVERTAKEN, Lease, Leases
 from appliance.ros.topics.publication import Outlet, PublicationFollower
-from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.staleness import StalenessDetector
 
 #: Reasons that are sent to clients are cut to so many characters.
@@ -59,23 +59,16 @@ class ToRos(Flow):
     follower: PublicationFollower
     _follower_type: ClassVar[type[PublicationFollower]] = PublicationFollower
 
-    def __init__(
-        self,
-        route: BridgeRoute,
-        ros: str,
-        converters: Converters,
-        log: LogFunction,
-        context: ToRosContext,
-    ) -> None:
-        follower = self._follower_type(route, ros, converters, log, self, context.post)
-        super().__init__(follower, log, FlowCounters())
+    def __init__(self, topic: RoutedTopic, context: ToRosContext) -> None:
+        follower = self._follower_type(topic, self, context.post)
+        super().__init__(follower, topic.log, FlowCounters())
         self.follower = follower
-        self._problems = ProblemLog(str(follower), log)
+        self._problems = ProblemLog(str(follower), topic.log)
         self._context = context
         self._is_left = True
         #: The topic's name on ROS, where a remapping gives it another.
-        self._name = ros
-        self._lease = Lease(ros)
+        self._name = topic.ros
+        self._lease = Lease(topic.ros)
 
     def fail(self, problem: str) -> None:
         """Count a message that could not be carried, and log that at most once a minute."""
