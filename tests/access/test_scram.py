@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from appliance_process import ApplianceProcess
+from command_line import run, set_up
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from raw_client import RawClient
@@ -21,7 +22,6 @@ from appliance.access import AccessFileError, FileAccess, Passwords
 from appliance.access import scram as scram_module
 from appliance.access.scram import METHOD, ScramExchange, Verifier, saslprep
 from appliance.broker.ports import Accepted, Identity, Refusal
-from appliance.cli import main as cli
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Auth,
@@ -624,17 +624,7 @@ def test_a_restart_does_not_tell_strangers_from_users(
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert run("init", "--robot", "r2", "--user", "alice") == 0
-    return tmp_path
-
-
-def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(arguments))
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
+    return set_up(tmp_path, monkeypatch)
 
 
 def test_the_commands(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,23 +10,16 @@ from typing import Any
 
 import pytest
 from appliance_process import ApplianceProcess
+from command_line import run
 from raw_client import RawClient
 
 from appliance import config
 from appliance.app.status import Status, _shortage, topic_shown
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Identity, InsideLink, Limits
-from appliance.cli import main as cli
 from appliance.config import reading
 from appliance.mqtt.packets import Publish
 from appliance.store import MemoryStore
-
-
-def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(arguments))
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 def status(appliance: ApplianceProcess, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:

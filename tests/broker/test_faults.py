@@ -449,6 +449,14 @@ def test_an_ended_session_is_no_member_of_its_group(broker, other, monkeypatch, 
     escaped.clear()
 
 
+def comes_back(broker, other, properties):
+    """The client `a` is let in again, and nothing is left of what went wrong."""
+    again = join(broker, "a", properties=properties)
+    assert again.session.link is again.client.output
+    goes_on(broker, other)
+    check_accounts(broker)
+
+
 @pytest.mark.patches
 @pytest.mark.parametrize("expiry", [0, 60])
 @pytest.mark.parametrize("leaves", [False, True], ids=["lost", "disconnects"])
@@ -489,10 +497,7 @@ def test_an_end_comes_to_its_end(broker, other, monkeypatch, escaped, whose, nam
     if name != "_publish_late":
         assert len(wills) == (0 if leaves else 1)
     monkeypatch.undo()
-    again = join(broker, "a", properties=keeps)
-    assert again.session.link is again.client.output
-    goes_on(broker, other)
-    check_accounts(broker)
+    comes_back(broker, other, keeps)
     escaped.clear()
 
 
@@ -598,10 +603,7 @@ def test_a_fault_at_the_end_of_a_login_leaves_nobody_connected(
     assert session is None or session.link is None
     assert not [each for each in other.received() if isinstance(each, Publish)]
     monkeypatch.undo()
-    again = join(broker, "a", properties=keeps)
-    assert again.session.link is again.client.output
-    goes_on(broker, other)
-    check_accounts(broker)
+    comes_back(broker, other, keeps)
     escaped.clear()
 
 

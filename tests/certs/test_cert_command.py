@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from authorities import Company
+from command_line import run
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed25519, rsa
@@ -25,18 +26,10 @@ from cryptography.x509.oid import NameOID
 
 from appliance import certs
 from appliance.certs.requests import load_request
-from appliance.cli import main as cli
 
 needs_openssl = pytest.mark.skipif(
     shutil.which("openssl") is None, reason="the openssl command is not installed"
 )
-
-
-def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(arguments))
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 def openssl(*arguments: str | Path) -> str:

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import pytest
 import typer
 import yaml
+from command_line import run, set_up
 from waiting import PATIENCE, eventually
 
 from appliance import config
@@ -23,20 +24,10 @@ from appliance.ops.check import check
 from appliance.store import database
 
 
-def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(arguments))
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
-
-
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder that was set up with `init`, as the current one."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert run("init", "--robot", "r2", "--user", "alice") == 0
-    return tmp_path
+    return set_up(tmp_path, monkeypatch)
 
 
 @pytest.fixture

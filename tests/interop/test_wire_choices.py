@@ -35,6 +35,14 @@ CONTROL = {"U+0001": "01", "U+001F": "1f", "U+007F": "7f", "U+009F": "c29f"}
 DEEP = "T" + "/" * 199
 TOO_DEEP = "T" + "/" * 200
 
+#: For the QoS of a delivery: the acknowledgements that are not of that QoS, and their first bytes.
+WRONG_ANSWERS = (
+    (1, "PUBREC", "50"),
+    (1, "PUBCOMP", "70"),
+    (2, "PUBACK", "40"),
+    (2, "PUBCOMP", "70"),
+)
+
 #: mosquitto does all of this from 2.0 on: these run against it too.
 PROVED = {
     # CONNECT
@@ -293,12 +301,7 @@ PROVED = {
         a< {30 + 2 * qos}| ~'T/x' @1 'm'
         a> {answer} 02 0001
         a."""
-        for qos, name, answer in (
-            (1, "PUBREC", "50"),
-            (1, "PUBCOMP", "70"),
-            (2, "PUBACK", "40"),
-            (2, "PUBCOMP", "70"),
-        )
+        for qos, name, answer in WRONG_ANSWERS
     },
     "PUBREL that is answered with PUBREC comes again": """
         a+ 4
@@ -584,12 +587,7 @@ CHOSEN = {
         a> {answer} 02 0001
         a< e0 01 82
         a."""
-        for qos, name, answer in (
-            (1, "PUBREC", "50"),
-            (1, "PUBCOMP", "70"),
-            (2, "PUBACK", "40"),
-            (2, "PUBCOMP", "70"),
-        )
+        for qos, name, answer in WRONG_ANSWERS
     },
     "a message that is larger than the client takes is not sent, but has its packet identifier": """
         a+ 5 {27 #40}

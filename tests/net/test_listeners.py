@@ -18,8 +18,8 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-import uvloop
 import yaml
+from both_loops import event_loop_policy as event_loop_policy
 from harness import Harness, Peer, make_contexts
 from waiting import PATIENCE, until
 
@@ -52,15 +52,6 @@ from appliance.net.listeners import Admission, ListenerSettings
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 MIB = 1 << 20
-
-
-@pytest.fixture(
-    scope="module",
-    params=[asyncio.DefaultEventLoopPolicy(), uvloop.EventLoopPolicy()],
-    ids=["asyncio", "uvloop"],
-)
-def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLoopPolicy:
-    return request.param  # type: ignore[no-any-return]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from typing import Any
 
 import psutil
 import pytest
-import uvloop
+from both_loops import event_loop_policy as event_loop_policy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from waiting import PATIENCE, until
@@ -74,15 +74,6 @@ async def asyncios(
     await asyncio.get_running_loop().connect_accepted_socket(
         lambda: protocol, connection, ssl=context, ssl_handshake_timeout=timeout
     )
-
-
-@pytest.fixture(
-    scope="module",
-    params=[asyncio.DefaultEventLoopPolicy(), uvloop.EventLoopPolicy()],
-    ids=["asyncio", "uvloop"],
-)
-def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLoopPolicy:
-    return request.param  # type: ignore[no-any-return]
 
 
 @pytest.fixture(scope="module")
@@ -377,15 +368,21 @@ async def test_a_chunk_of_many_records_is_handed_on_as_one(harness: Harness):
     assert served.chunks == 1
 
 
-async def test_many_records_in_one_chunk_take_turns(harness: Harness):
-    """Some of them at a time, whatever they hold, and what ends the connection behind them all."""
-    scheduler = LayerScheduler()
+async def log_in_on(harness: Harness, scheduler: LayerScheduler) -> tuple[Peer, Served]:
+    """Both ends of a connection over our transport, which takes its turns by this scheduler."""
     served = Served()
     peer, accepted = await harness.dial()
     harness.all.append(served)
     shaking = asyncio.ensure_future(peer.shake_hands())
     await own(accepted, harness.server, served, PATIENCE, scheduler)
     await shaking
+    return peer, served
+
+
+async def test_many_records_in_one_chunk_take_turns(harness: Harness):
+    """Some of them at a time, whatever they hold, and what ends the connection behind them all."""
+    scheduler = LayerScheduler()
+    peer, served = await log_in_on(harness, scheduler)
     text = noise(5000)
     await peer.put(b"".join(peer.seal(text[n : n + 1]) for n in range(len(text))))
     peer.sock.shutdown(socket.SHUT_WR)
@@ -397,12 +394,7 @@ async def test_many_records_in_one_chunk_take_turns(harness: Harness):
 
 async def test_while_others_have_to_be_served_a_chunk_waits(harness: Harness):
     scheduler = LayerScheduler()
-    served = Served()
-    peer, accepted = await harness.dial()
-    harness.all.append(served)
-    shaking = asyncio.ensure_future(peer.shake_hands())
-    await own(accepted, harness.server, served, PATIENCE, scheduler)
-    await shaking
+    peer, served = await log_in_on(harness, scheduler)
     queued: list[Schedulable] = []
     scheduler.busy, scheduler.queue_turn = True, queued.append  # type: ignore[method-assign]
     await peer.put(peer.seal(b"little"))

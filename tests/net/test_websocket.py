@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import paho.mqtt.client as paho
 import pytest
-import uvloop
+from both_loops import event_loop_policy as event_loop_policy
 from harness import Harness, Peer, PublishObserver, abort, make_contexts
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from waiting import PATIENCE, until
@@ -52,15 +52,6 @@ from appliance.net.websocket import FRAME_COST
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 MIB = 1 << 20
-
-
-@pytest.fixture(
-    scope="module",
-    params=[asyncio.DefaultEventLoopPolicy(), uvloop.EventLoopPolicy()],
-    ids=["asyncio", "uvloop"],
-)
-def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLoopPolicy:
-    return request.param  # type: ignore[no-any-return]
 
 
 @pytest.fixture(scope="module")

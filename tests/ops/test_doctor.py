@@ -15,22 +15,15 @@ from typing import Any
 import pytest
 import yaml
 from appliance_process import ApplianceProcess
+from command_line import run
 from waiting import eventually
 
 from appliance import certs, config
-from appliance.cli import main as cli
 from appliance.config import Settings
 from appliance.ops.doctor import computer, examination, ports, ros, ros1, secrets
 from appliance.ops.doctor.examination import Part, examine
 from appliance.ops.finding import Finding
 from appliance.ros.ros2 import discovery, fastdds
-
-
-def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        cli.main(list(arguments))
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 @pytest.fixture

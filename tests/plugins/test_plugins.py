@@ -51,6 +51,14 @@ def code_of(answer: Identity | Refusal) -> ReasonCode:
     return answer.code if isinstance(answer, Refusal) else ReasonCode.SUCCESS
 
 
+async def check_only_bob(rig: Any) -> None:
+    """Only bob is let in, and with his right password."""
+    assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
+    for wrong in (bob(password="wrong"), connect_of("eve", b"x")):
+        answer = await rig.login.authenticate(wrong, HOST)
+        assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
+
+
 # --- JWT -----------------------------------------------------------------------------------------
 
 
@@ -321,10 +329,7 @@ async def test_sql(tmp_path: Path) -> None:
             await users.create_user_auth("bob", PASSWORD)
             await topics.create_topic_auth("bob")
             await topics.add_allowed_topic("bob", "a/b", AmqttAction.PUBLISH)
-        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
-        for wrong in (bob(password="wrong"), connect_of("eve", b"x")):
-            answer = await rig.login.authenticate(wrong, HOST)
-            assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
+        await check_only_bob(rig)
         assert await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "a/b")
         assert not await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "a/c")
 
@@ -401,10 +406,7 @@ async def test_ldap(directory: Directory) -> None:
         "amqtt.contrib.ldap.TopicAuthLdapPlugin": LDAP | attributes,
     }
     async with running(plugins) as rig:
-        assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
-        for wrong in (bob(password="wrong"), connect_of("eve", b"x")):
-            answer = await rig.login.authenticate(wrong, HOST)
-            assert code_of(answer) == ReasonCode.NOT_AUTHORIZED
+        await check_only_bob(rig)
         assert await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "a/b")
         assert not await decided(rig, Identity("bob", "c1"), Action.PUBLISH, "b/c")
         assert threading.get_ident() not in directory.threads
