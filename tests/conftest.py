@@ -77,6 +77,12 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AppliancePro
 
 
 @pytest.fixture
+def name() -> str:
+    """For client ids and topics that no other test uses."""
+    return uuid.uuid4().hex[:12]
+
+
+@pytest.fixture
 def topic() -> str:
     """A topic of the robot's that no other test uses."""
     return f"{ROBOT}/test-{uuid.uuid4().hex[:12]}"

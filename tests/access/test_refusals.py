@@ -9,7 +9,6 @@ import socket
 import ssl
 import subprocess
 import sys
-import uuid
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -56,12 +55,6 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess
     process.start()
     yield process
     process.stop()
-
-
-@pytest.fixture
-def name() -> str:
-    """For client ids and topics that no other test uses."""
-    return uuid.uuid4().hex[:12]
 
 
 Open = Callable[..., RawClient]

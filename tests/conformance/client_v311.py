@@ -6,14 +6,19 @@ Packets are written as they are on the wire, as hex with spaces where a field en
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 from broker.conftest import Peer
+from raw_client import RawClient
 
 from appliance.broker.broker import Broker
 
 #: A packet as bytes or as hex; spaces in it mean nothing.
 Wire: TypeAlias = "bytes | str"
+
+#: Makes connections that nothing was said on yet.
+Dial: TypeAlias = Callable[[], RawClient]
 
 ACCEPTED = bytes.fromhex("20 02 00 00")
 SESSION_PRESENT = bytes.fromhex("20 02 01 00")
@@ -94,6 +99,16 @@ def joined(broker: Broker, client_id: str = "client", **options: object) -> Clie
     """A client that was accepted; what came behind its CONNACK is not heard yet."""
     client = Client(broker)
     assert client.connect(client_id, **options).reason_code == 0
+    return client
+
+
+def owed(client: Client, count: int) -> Client:
+    """The client; it has been sent so many messages of QoS 2, and has answered none of them."""
+    client.subscribe("a", 2)
+    sender = joined(client.broker, "sender")
+    for _ in range(count):
+        sender.publish("a", b"x", 2)
+    client.hear()
     return client
 
 

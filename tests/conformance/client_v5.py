@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import client_v311
 from client_v311 import CLEAN_SESSION, PASSWORD, USER_NAME, WILL, WILL_RETAIN, Wire, field
+from client_v311 import Dial as Dial
+from client_v311 import owed as owed
 from client_v311 import packet as packet
 from client_v311 import wire as wire
 

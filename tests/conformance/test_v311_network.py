@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-import uuid
-from collections.abc import Callable, Iterator
 
 import pytest
-from appliance_process import ApplianceProcess
-from client_v311 import CLEAN_SESSION, PASSWORD, USER_NAME, connect, field, packet, wire
+from client_v311 import CLEAN_SESSION, PASSWORD, USER_NAME, Dial, connect, field, packet, wire
 from raw_client import RawClient
 from waiting import PATIENCE
 
@@ -18,22 +14,9 @@ from appliance.mqtt.packets import Publish, Subscribe, Subscription, Will
 statement = pytest.mark.statement
 
 
-@pytest.fixture(params=[False, True], ids=["tcp", "tls"])
-def dial(
-    appliance: ApplianceProcess, request: pytest.FixtureRequest
-) -> Iterator[Callable[[], RawClient]]:
-    """Makes connections that nothing was said on yet."""
-    with contextlib.ExitStack() as stack:
-        yield lambda: stack.enter_context(RawClient(appliance, 4, tls=request.param))
-
-
-Dial = Callable[[], RawClient]
-
-
 @pytest.fixture
-def name() -> str:
-    """For client ids and topics that no other test uses."""
-    return uuid.uuid4().hex[:12]
+def version() -> int:
+    return 4
 
 
 def say(client: RawClient, *packets: bytes | str) -> None:

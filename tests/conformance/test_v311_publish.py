@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from broker.conftest import FakeAccess
-from client_v311 import SESSION_PRESENT, Client, connect, field, joined, packet, refused, wire
+from client_v311 import SESSION_PRESENT, Client, connect, field, joined, owed, packet, refused, wire
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Action
@@ -336,11 +336,7 @@ def test_qos_2_to_a_client_step_by_step(broker: Broker) -> None:
 
 @statement("3.1.1", "MQTT-4.3.3-1", "MQTT-2.3.1-6")
 def test_each_pubrec_has_its_pubrel(broker: Broker) -> None:
-    client, sender = joined(broker), joined(broker, "sender")
-    client.subscribe("a", 2)
-    for _ in range(3):
-        sender.publish("a", b"", 2)
-    client.hear()
+    client = owed(joined(broker), 3)
     for packet_id in ("0002", "0001", "0003", "0001"):
         assert client.say(f"50 02 {packet_id}") == wire(f"62 02 {packet_id}")
 

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import pytest
 from broker.conftest import FakeStore
-from client_v311 import ACCEPTED, SESSION_PRESENT, Client, connect, joined, packet, refused, wire
+from client_v311 import (
+    ACCEPTED,
+    SESSION_PRESENT,
+    Client,
+    connect,
+    joined,
+    owed,
+    packet,
+    refused,
+    wire,
+)
 
 from appliance.broker.broker import Broker
 from appliance.broker.ports import Limits
@@ -164,11 +174,7 @@ def test_acknowledgements_come_in_the_order_of_the_messages(broker: Broker) -> N
 
 @statement("3.1.1", "MQTT-4.6.0-4", "MQTT-4.6.0-6")
 def test_pubrel_comes_in_the_order_of_pubrec(broker: Broker) -> None:
-    client, publisher = joined(broker), joined(broker, "publisher")
-    client.subscribe("a", 2)
-    for _ in range(4):
-        publisher.publish("a", b"", 2)
-    client.hear()
+    client = owed(joined(broker), 4)
     assert client.say("50 02 0003", "50 02 0001", "50 02 0004", "50 02 0002") == wire(
         "62 02 0003 62 02 0001 62 02 0004 62 02 0002"
     )

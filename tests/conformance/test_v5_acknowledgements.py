@@ -17,24 +17,29 @@ statement = pytest.mark.statement
 # --- reason codes that the server sends
 
 
-@statement("5.0", "MQTT-3.4.2-1")
-def test_puback_says_what_became_of_the_message(broker: Broker, access: FakeAccess) -> None:
+@pytest.mark.parametrize(
+    ("qos", "heard", "nobody_hears", "denied"),
+    [
+        pytest.param(
+            *(1, "40 02 0001", "40 03 0002 10", "40 03 0003 87"),
+            marks=statement("5.0", "MQTT-3.4.2-1"),
+        ),
+        pytest.param(
+            *(2, "50 02 0001", "50 02 0002", "50 03 0003 87"),
+            marks=statement("5.0", "MQTT-3.5.2-1"),
+        ),
+    ],
+    ids=["PUBACK", "PUBREC"],
+)
+def test_the_answer_says_what_became_of_the_message(
+    broker: Broker, access: FakeAccess, qos: int, heard: str, nobody_hears: str, denied: str
+) -> None:
     access.deny("user", Action.PUBLISH, "no/#")
     joined(broker, "watcher").subscribe("a")
     client = joined(broker)
-    assert client.say(publish("a", b"x", 1, 1)) == wire("40 02 0001")
-    assert client.say(publish("b", b"x", 1, 2)) == wire("40 03 0002 10")
-    assert client.say(publish("no/a", b"x", 1, 3)) == wire("40 03 0003 87")
-
-
-@statement("5.0", "MQTT-3.5.2-1")
-def test_pubrec_says_what_became_of_the_message(broker: Broker, access: FakeAccess) -> None:
-    access.deny("user", Action.PUBLISH, "no/#")
-    joined(broker, "watcher").subscribe("a")
-    client = joined(broker)
-    assert client.say(publish("a", b"x", 2, 1)) == wire("50 02 0001")
-    assert client.say(publish("b", b"x", 2, 2)) == wire("50 02 0002")
-    assert client.say(publish("no/a", b"x", 2, 3)) == wire("50 03 0003 87")
+    assert client.say(publish("a", b"x", qos, 1)) == wire(heard)
+    assert client.say(publish("b", b"x", qos, 2)) == wire(nobody_hears)
+    assert client.say(publish("no/a", b"x", qos, 3)) == wire(denied)
 
 
 @statement("5.0", "MQTT-3.4.2-1", "MQTT-3.5.2-1")

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
-import uuid
-from collections.abc import Callable, Iterator
 
 import pytest
-from appliance_process import ApplianceProcess
-from client_v5 import connack, connect, disconnect, properties, publish, wire
+from client_v5 import Dial, connack, connect, disconnect, properties, publish, wire
 from raw_client import RawClient
 from waiting import PATIENCE
 
@@ -18,22 +14,9 @@ from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription, Wil
 statement = pytest.mark.statement
 
 
-@pytest.fixture(params=[False, True], ids=["tcp", "tls"])
-def dial(
-    appliance: ApplianceProcess, request: pytest.FixtureRequest
-) -> Iterator[Callable[[], RawClient]]:
-    """Makes connections that nothing was said on yet."""
-    with contextlib.ExitStack() as stack:
-        yield lambda: stack.enter_context(RawClient(appliance, 5, tls=request.param))
-
-
-Dial = Callable[[], RawClient]
-
-
 @pytest.fixture
-def name() -> str:
-    """For client ids that no other test uses."""
-    return uuid.uuid4().hex[:12]
+def version() -> int:
+    return 5
 
 
 def joined(dial: Dial, client_id: str, user: str = "alice", **fields: object) -> RawClient:
