@@ -10,7 +10,7 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from appliance_process import HOST, ApplianceProcess
@@ -312,13 +312,22 @@ def test_explain_names_the_file_and_the_line(robot: ApplianceProcess) -> None:
 
 # --- Another's client id
 
+
+class Stranger(NamedTuple):
+    """Somebody who is not alice, and the CONNACK for them by version."""
+
+    user: str | None
+    password: str | None
+    refusal: dict[int, bytes]
+
+
 strangers = pytest.mark.parametrize(
-    ("user", "password", "refusal"),
+    "stranger",
     [
-        ("alice", "wrong", NOT_AUTHORIZED),
-        ("mallory", "x", NOT_AUTHORIZED),
-        (None, None, NOT_AUTHORIZED),
-        ("bob", None, NOT_YOUR_ID),  # with his right password
+        Stranger("alice", "wrong", NOT_AUTHORIZED),
+        Stranger("mallory", "x", NOT_AUTHORIZED),
+        Stranger(None, None, NOT_AUTHORIZED),
+        Stranger("bob", None, NOT_YOUR_ID),  # with his right password
     ],
     ids=["wrong-password", "unknown-user", "no-user", "another-user"],
 )
@@ -348,32 +357,32 @@ class Victim:
         assert connection.receive()[0] == 0x90
         return connection
 
-    def attack(self, user: str | None, password: str | None, refusal: bytes) -> None:
+    def attack(self, stranger: Stranger) -> None:
         """CONNECTs that would end, take over or change the session."""
+        user, password, refusal = stranger
         will = Will(f"r2d2/cmd_vel/{self.name}", b"the stranger's", 1)
         for clean in (True, False):
-            stranger = self.client()
+            client = self.client()
             fields = {**self.lasting, "clean": clean, "will": will}
-            assert stranger.connect(self.client_id, user, password, **fields) == refusal
-            assert stranger.receive() == b""
+            answer = client.connect(self.client_id, user, password, **fields)
+            assert answer == refusal[client.version]
+            assert client.receive() == b""
+
+
+@pytest.fixture
+def victim(client: Open, version: int, name: str) -> Victim:
+    return Victim(client, version, name)
 
 
 @both_versions
 @both_ways
 @strangers
 def test_a_stranger_does_not_touch_a_connected_client(
-    robot: ApplianceProcess,
-    client: Open,
-    version: int,
-    name: str,
-    user: str | None,
-    password: str | None,
-    refusal: dict[int, bytes],
+    robot: ApplianceProcess, client: Open, name: str, victim: Victim, stranger: Stranger
 ) -> None:
-    victim = Victim(client, version, name)
     connection = victim.subscribed()
     watcher = watch(client, name, f"r2d2/cmd_vel/{name}")
-    victim.attack(user, password, refusal[version])
+    victim.attack(stranger)
     assert connection.drain() == []
     publish(watcher, victim.topic, b"still here")
     assert acknowledge(connection, connection.drain()) == [(victim.topic, b"still here")]
@@ -383,7 +392,7 @@ def test_a_stranger_does_not_touch_a_connected_client(
     received = acknowledge(watcher, watcher.drain())
     assert received == [(f"r2d2/cmd_vel/{name}", b"the victim's")]
     lines = robot.wait_for_log(f"client '{victim.client_id}'.* refused: ", 2)
-    if user == "bob":
+    if stranger.user == "bob":
         belongs = (
             f"client id '{victim.client_id}' belongs to client '{victim.client_id}' (user 'alice')"
         )
@@ -394,15 +403,8 @@ def test_a_stranger_does_not_touch_a_connected_client(
 @both_ways
 @strangers
 def test_a_stranger_does_not_touch_an_absent_client(
-    robot: ApplianceProcess,
-    client: Open,
-    version: int,
-    name: str,
-    user: str | None,
-    password: str | None,
-    refusal: dict[int, bytes],
+    client: Open, name: str, victim: Victim, stranger: Stranger
 ) -> None:
-    victim = Victim(client, version, name)
     bob = client(f"bob-{name}", "bob")
     connection = victim.subscribed()
     publish(bob, victim.topic, b"in flight")
@@ -410,7 +412,7 @@ def test_a_stranger_does_not_touch_an_absent_client(
     connection.send(Disconnect())
     assert connection.receive() == b""
     publish(bob, victim.topic, b"before")
-    victim.attack(user, password, refusal[version])
+    victim.attack(stranger)
     publish(bob, victim.topic, b"after")
     back = victim.client()
     answer = back.connect(victim.client_id, will=victim.will, **victim.lasting)
@@ -429,18 +431,12 @@ def test_a_stranger_does_not_touch_an_absent_client(
 @pytest.mark.parametrize("version", [5])
 @pytest.mark.parametrize("tls", [True], ids=["tls"])
 def test_a_stranger_does_not_hold_up_a_delayed_will(
-    client: Open,
-    version: int,
-    name: str,
-    user: str | None,
-    password: str | None,
-    refusal: dict[int, bytes],
+    client: Open, name: str, victim: Victim, stranger: Stranger
 ) -> None:
-    victim = Victim(client, version, name)
     victim.will.properties = {Property.WILL_DELAY_INTERVAL: 1}
     watcher = watch(client, name, f"r2d2/cmd_vel/{name}")
     victim.connect().kill()
-    victim.attack(user, password, refusal[version])
+    victim.attack(stranger)
     will = watcher.decode(watcher.receive())
     assert isinstance(will, Publish) and will.payload == b"the victim's"
 
@@ -466,19 +462,12 @@ def test_a_client_id_belongs_to_nobody_when_its_session_has_ended(
 @pytest.mark.parametrize("size", [10, 200_000])
 @strangers
 def test_what_comes_behind_a_refused_connect_has_no_effect(
-    client: Open,
-    version: int,
-    name: str,
-    size: int,
-    user: str | None,
-    password: str | None,
-    refusal: dict[int, bytes],
+    client: Open, version: int, name: str, victim: Victim, size: int, stranger: Stranger
 ) -> None:
-    victim = Victim(client, version, name)
     connection = victim.subscribed()
     topic = f"r2d2/cmd_vel/{name}"
     watcher = watch(client, name, topic)
-    stranger = client()
+    attacker = client()
     behind: list[Packet] = [
         Publish(topic, b"x" * size, 0, retain=True),
         Publish(topic, b"x" * size, 1, packet_id=1),
@@ -486,13 +475,13 @@ def test_what_comes_behind_a_refused_connect_has_no_effect(
         Pubrel(2),
         Subscribe(3, [Subscription("r2d2/#", 1)]),
     ]
-    data = stranger.connect_packet(victim.client_id, user, password)
+    data = attacker.connect_packet(victim.client_id, stranger.user, stranger.password)
     data += b"".join(packet.encode(version) for packet in behind)
-    data += stranger.connect_packet(victim.client_id)  # this would be right
+    data += attacker.connect_packet(victim.client_id)  # this would be right
     try:
-        stranger.socket.sendall(data)
-        assert stranger.receive() == refusal[version]
-        assert stranger.receive() == b""
+        attacker.socket.sendall(data)
+        assert attacker.receive() == stranger.refusal[version]
+        assert attacker.receive() == b""
     except (ConnectionError, ssl.SSLError):
         # It was closed upon while it was still sending: then the answer may be lost on its way.
         assert size > 10
