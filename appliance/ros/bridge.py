@@ -23,7 +23,6 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
@@ -32,6 +31,7 @@ from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics, DiagnosticsTopic
 from appliance.ros.graph_follower import FlowKey, GraphFollower, TopicRoutes
+from appliance.ros.link import ReceivingLink
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
@@ -257,7 +257,7 @@ class Bridge:
 
     def start(self) -> None:
         """Subscribe on MQTT, and join the bus in the background."""
-        self._session = self._broker.attach(BRIDGE_CLIENT_ID, _BridgeLink(self._receive))
+        self._session = self._broker.attach(BRIDGE_CLIENT_ID, ReceivingLink(self._receive))
         self._subscribe()
         self._broker.departures.append(self._context.staleness.on_departed)
         self.calls.start()
@@ -345,11 +345,11 @@ class Bridge:
         """The full name of the bridge's node."""
         return self._node.name
 
-    def _receive(self, message: Message, retain: bool, origin: Session | None) -> None:
+    def _receive(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
         size = size_of(message.payload)
         number = self._context.staleness.next_number()
         for receiver in self._receivers.get(message.topic, ()):
-            self._dispatch(receiver, message, retain, origin, number, size)
+            self._dispatch(receiver, message, retain, message.publisher, number, size)
 
     def _dispatch(
         self,
@@ -548,22 +548,3 @@ class Bridge:
             self._entries.from_thread("bridge.post", callback, *args, served=served, failed=failed)
         except RuntimeError:  # the loop is closed: nobody can receive it
             log.debug("the event loop is closed")
-
-
-class _BridgeLink(InsideLink):
-    """The link of the bridge's session."""
-
-    def __init__(self, receive: Callable[[Message, bool, Session | None], None]) -> None:
-        self._receive = receive
-
-    def publish(
-        self,
-        message: Message,
-        qos: int,
-        packet_id: int,
-        dup: bool,
-        retain: bool,
-        subscription_ids: list[int] | None,
-    ) -> None:
-        """A message for ROS."""
-        self._receive(message, retain, message.publisher)

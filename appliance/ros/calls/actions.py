@@ -34,12 +34,12 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.net.callbacks import Entries
 from appliance.ros.calls import goals
 from appliance.ros.calls.action_topics import ActionSnapshot, ActionSubscriptions, ActionTopics
+from appliance.ros.calls.context import CallContext
 from appliance.ros.calls.dispatcher import (
     WITHOUT_RAW,
     Answer,
     Call,
     CallCounters,
-    CallDispatcher,
     CallEndpoint,
     CallError,
     ConcurrencyLimiter,
@@ -49,13 +49,12 @@ from appliance.ros.calls.dispatcher import (
 )
 from appliance.ros.calls.fair_cache import FairCache
 from appliance.ros.calls.goals import ALL, CANCEL
-from appliance.ros.calls.requests import Requests
 from appliance.ros.calls.serialization import to_request
 from appliance.ros.calls.service_clients import Key
 from appliance.ros.mailbox import Mailbox
-from appliance.ros.node import BusError, RosNode
+from appliance.ros.node import BusError
 from appliance.ros.patterns import assign, compile_pattern, refusals
-from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.converter import ConversionError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import CONTENT_TYPE, RAW, VALUE_ENCODINGS
 from appliance.ros.skipped import Skipped, SkipReason
@@ -182,23 +181,11 @@ class _BackgroundTasks:
 class ActionRoutes:
     """The routes of actions; for the loop's thread, and `topics` for the ROS thread."""
 
-    def __init__(
-        self,
-        dispatcher: CallDispatcher,
-        requests: Requests,
-        converters: Converters,
-        node: RosNode,
-        entries: Entries,
-        post: Callable[..., None],
-        mailbox: Mailbox,
-    ) -> None:
-        self._dispatcher = dispatcher
-        self._requests = requests
-        self._converters = converters
-        self._node = node
-        self._post = post
+    def __init__(self, context: CallContext, mailbox: Mailbox) -> None:
+        self._context = context
+        self._requests = context.requests
         self._mailbox = mailbox
-        self.topics = ActionTopics(entries.faults, post)
+        self.topics = ActionTopics(context.entries.faults, context.post)
         self.goals = GoalRegistry()
         self._counters: dict[ActionSettings, CallCounters] = {}
         self._actions: dict[str, BridgedAction] = {}
@@ -206,12 +193,12 @@ class ActionRoutes:
         self._removed: list[BridgedAction] = []
         #: Actions on the bus that a pattern names and does not take.
         self._refused: list[Skipped] = []
-        self._tasks = _BackgroundTasks(entries)
+        self._tasks = _BackgroundTasks(context.entries)
 
     def start(self) -> None:
         """Clear what another run has left retained: nothing is known of the bus yet."""
         for route in self._counters:
-            self._dispatcher.clear_retained(route.mqtt, "{ros}", "_status")
+            self._context.dispatcher.clear_retained(route.mqtt, "{ros}", "_status")
 
     def replace(self, routes: Sequence[ActionSettings]) -> None:
         """Use these routes from now on; one that was there before goes on without a break."""
@@ -256,12 +243,8 @@ class ActionRoutes:
             ros,
             route,
             self._counters[route],
-            self._dispatcher,
-            self._requests,
-            self._converters,
-            self._node,
+            self._context,
             self._mailbox,
-            self._post,
             self.goals,
             self._tasks,
             partial(self._server_joined, ros),
@@ -373,12 +356,8 @@ class BridgedAction:
         ros: str,
         route: ActionSettings,
         counters: CallCounters,
-        dispatcher: CallDispatcher,
-        requests: Requests,
-        converters: Converters,
-        node: RosNode,
+        context: CallContext,
         mailbox: Mailbox,
-        post: Callable[..., None],
         registry: GoalRegistry,
         tasks: _BackgroundTasks,
         server_joined: Callable[[], None],
@@ -391,10 +370,10 @@ class BridgedAction:
         #: Called when another server of the action has appeared on the bus.
         self.server_joined = server_joined
         self._counters = counters
-        self._dispatcher = dispatcher
-        self._requests = requests
-        self._converters = converters
-        self._node = node
+        self._dispatcher = context.dispatcher
+        self._requests = context.requests
+        self._converters = converters = context.converters
+        self._node = node = context.node
         self._serialization = node.serialization
         self._registry = registry
         self._tasks = tasks
@@ -409,7 +388,7 @@ class BridgedAction:
         self._is_logged = False
         #: The ROS thread's side.
         self.subscriptions = ActionSubscriptions(
-            ros, self.base, route.encoding, node, converters, mailbox, self, post
+            ros, self.base, route.encoding, node, converters, mailbox, self, context.post
         )
         self._endpoints = [
             CallEndpoint(

@@ -34,13 +34,13 @@ from typing import Literal, TypeAlias, TypeVar
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.replay_guard import ReplayGuard
+from appliance.ros.link import ReceivingLink
 from appliance.ros.payload.converter import TooLargeError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import (
@@ -247,26 +247,6 @@ class CallEndpoint:
 MessageHandler: TypeAlias = Callable[[Session, Message], None]
 
 
-class _Link(InsideLink):
-    """The link of the dispatcher's session, for calls and for what `subscribe` is called with."""
-
-    def __init__(self, receive: Callable[[Session, Message, int], None]) -> None:
-        self._receive = receive
-
-    def publish(
-        self,
-        message: Message,
-        qos: int,
-        packet_id: int,
-        dup: bool,
-        retain: bool,
-        subscription_ids: list[int] | None,
-    ) -> None:
-        """Receive a message that a client has published to one of the topics."""
-        if message.publisher is not None and subscription_ids:
-            self._receive(message.publisher, message, subscription_ids[0])
-
-
 class CallDispatcher:
     """Receives calls from MQTT, dispatches them to endpoints and publishes the answers."""
 
@@ -292,7 +272,7 @@ class CallDispatcher:
 
     def start(self) -> None:
         """Subscribe to calls."""
-        self._session = self._broker.attach(CLIENT_ID, _Link(self.receive))
+        self._session = self._broker.attach(CLIENT_ID, ReceivingLink(self._receive))
         self._broker.departures.append(self._replay_guard.departed)
         for topic_filter in self._identifiers:
             self._subscribe_session(topic_filter)
@@ -378,12 +358,14 @@ class CallDispatcher:
         self.unsubscribe(topic)
         self.unsubscribe(f"{topic}/+")
 
-    def receive(self, publisher: Session, message: Message, identifier: int) -> None:
-        """Pass a message to the handler of the subscription with that identifier."""
+    def _receive(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
+        """Pass a message that a client has published to the handler of the subscription."""
+        if message.publisher is None or not subscription_ids:
+            return
         self._broker.counters.cost += len(message.payload) // BYTES_PER_COST_UNIT
-        handler = self._handlers.get(identifier)
+        handler = self._handlers.get(subscription_ids[0])
         if handler is not None:
-            handler(publisher, message)
+            handler(message.publisher, message)
 
     def publish(self, message: Message) -> ReasonCode:
         """Publish as the appliance; returns 0x10 when there is no matching subscription."""

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Iterable, Mapping
+from collections.abc import Coroutine, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import pybase64
 
-from appliance.net.callbacks import Entries
-from appliance.ros.calls.dispatcher import Call, CallDispatcher, CallError
+from appliance.ros.calls.context import CallContext
+from appliance.ros.calls.dispatcher import Call, CallError
 from appliance.ros.calls.parameter_events import EVENT, EVENTS, ParameterEvents
 from appliance.ros.calls.parameter_topics import (
     ParameterGroup,
@@ -27,10 +27,8 @@ from appliance.ros.calls.parameter_topics import (
     to_bytes,
     unlike,
 )
-from appliance.ros.calls.requests import Requests
-from appliance.ros.node import RosNode
 from appliance.ros.patterns import is_plain
-from appliance.ros.payload.converter import ConversionError, Converters, TooLargeError
+from appliance.ros.payload.converter import ConversionError, TooLargeError
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import VALUE_ENCODINGS
@@ -82,21 +80,13 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
 
     type_name = "rcl_interfaces/msg/ParameterValue"
 
-    def __init__(
-        self,
-        dispatcher: CallDispatcher,
-        requests: Requests,
-        converters: Converters,
-        node: RosNode,
-        entries: Entries,
-        post: Callable[..., None],
-    ) -> None:
-        super().__init__(dispatcher)
-        self._requests = requests
-        self._converters = converters
-        self._node = node
-        self._entries = entries
-        self.source = ParameterEvents(node, self, post)
+    def __init__(self, context: CallContext) -> None:
+        super().__init__(context.dispatcher)
+        self._requests = context.requests
+        self._converters = context.converters
+        self._node = context.node
+        self._entries = context.entries
+        self.source = ParameterEvents(context.node, self, context.post)
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_stopped = False
 

@@ -13,6 +13,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.faults import Faults
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.actions import ActionRoutes, ActionSettings
+from appliance.ros.calls.context import CallContext
 from appliance.ros.calls.dispatcher import CallCounters, CallDispatcher, CallLimits
 from appliance.ros.calls.parameter_server import ServerParameters
 from appliance.ros.calls.parameter_topics import ParameterSettings
@@ -128,19 +129,14 @@ class CallBridge:
         self._routes = CallRoutes()
         self.dispatcher = CallDispatcher(broker, entries, conversions)
         self._requests = Requests(node, entries.loop, post, self._follow)
-        self._services = ServiceRoutes(
-            self.dispatcher, self._requests, converters, node, entries, post, announce
-        )
-        self._actions = ActionRoutes(
-            self.dispatcher, self._requests, converters, node, entries, post, mailbox
-        )
+        context = CallContext(self.dispatcher, self._requests, converters, node, entries, post)
+        self._services = ServiceRoutes(context, announce)
+        self._actions = ActionRoutes(context, mailbox)
         self._parameters: ParameterRoutes | ServerParameters
         if node.parameter_server is not None:
             self._parameters = ServerParameters(self.dispatcher, node, entries.loop, post, announce)
         else:
-            self._parameters = ParameterRoutes(
-                self.dispatcher, self._requests, converters, node, entries, post
-            )
+            self._parameters = ParameterRoutes(context)
         followers = (self._services.servers, self._actions.topics, self._parameters.source)
         self.poller = CallPoller(self._requests.clients, followers, broker.faults, post)
 

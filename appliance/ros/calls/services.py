@@ -26,24 +26,22 @@ from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
-from appliance.net.callbacks import Entries
+from appliance.ros.calls.context import CallContext
 from appliance.ros.calls.dispatcher import (
     REPORT_INTERVAL,
     WITHOUT_RAW,
     Answer,
     Call,
     CallCounters,
-    CallDispatcher,
     CallEndpoint,
     CallError,
 )
-from appliance.ros.calls.requests import Requests
 from appliance.ros.calls.serialization import from_ros, to_request
 from appliance.ros.calls.service_clients import Key
 from appliance.ros.calls.service_server import ServiceServer, ServiceServers
-from appliance.ros.node import BusError, Respond, RosNode
+from appliance.ros.node import BusError, Respond
 from appliance.ros.patterns import assign, compile_pattern, refusals
-from appliance.ros.payload.converter import ConversionError, Converters
+from appliance.ros.payload.converter import ConversionError
 from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import (
@@ -59,8 +57,6 @@ log = logging.getLogger(__name__)
 _OF_EVERY_NODE = re.compile(
     r"(rcl_interfaces|type_description_interfaces)/srv/.*|roscpp/srv/(GetLoggers|SetLoggerLevel)"
 )
-
-Post = Callable[..., None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,23 +85,12 @@ class ServiceSettings:
 class ServiceRoutes:
     """The routes of services; for the loop's thread, and `servers` for the ROS thread."""
 
-    def __init__(
-        self,
-        dispatcher: CallDispatcher,
-        requests: Requests,
-        converters: Converters,
-        node: RosNode,
-        entries: Entries,
-        post: Post,
-        changed: Callable[[], None],
-    ) -> None:
+    def __init__(self, context: CallContext, changed: Callable[[], None]) -> None:
         """`changed` is called when what `skips` gives has changed."""
-        self._dispatcher = dispatcher
-        self._requests = requests
-        self._converters = converters
-        self._node = node
-        self._entries = entries
-        self._post = post
+        self._context = context
+        self._dispatcher = context.dispatcher
+        self._requests = context.requests
+        self._converters = context.converters
         self._changed = changed
         self.servers = ServiceServers()
         self._counters: dict[ServiceSettings, CallCounters] = {}
@@ -131,14 +116,7 @@ class ServiceRoutes:
         for route in wanted:
             if route not in self._provided:
                 self._provided[route] = ProvidedService(
-                    route,
-                    self._counters[route],
-                    self._dispatcher,
-                    self._converters,
-                    self._node,
-                    self._entries,
-                    self._post,
-                    self._changed,
+                    route, self._counters[route], self._context, self._changed
                 )
         self.servers.replace(provided.server for provided in self._provided.values())
         self.follow()
@@ -187,7 +165,7 @@ class ServiceRoutes:
             self._counters[route],
             partial(self._handle, name, route),
             route.encoding,
-            (*WITHOUT_RAW, self._node.serialization.encoding),
+            (*WITHOUT_RAW, self._context.node.serialization.encoding),
         )
         self._endpoints[name] = route, endpoint
         self._dispatcher.register(endpoint)
@@ -328,21 +306,17 @@ class ProvidedService:
         self,
         route: ServiceSettings,
         counters: CallCounters,
-        dispatcher: CallDispatcher,
-        converters: Converters,
-        node: RosNode,
-        entries: Entries,
-        post: Post,
+        context: CallContext,
         changed: Callable[[], None],
     ) -> None:
         assert route.type is not None
         self._route = route
         self._counters = counters
-        self._dispatcher = dispatcher
-        self._converters = converters
-        self._node = node
-        self._entries = entries
-        self._post = post
+        self._dispatcher = context.dispatcher
+        self._converters = context.converters
+        self._node = context.node
+        self._entries = context.entries
+        self._post = context.post
         self._changed = changed
         (self._ros,) = route.names
         self._base = route.base(self._ros)
@@ -354,7 +328,7 @@ class ProvidedService:
         self._problem: str | None = None
         self._dispatcher.subscribe(f"{self._base}/_response/+", self._on_response)
         self.server = ServiceServer(
-            self._ros, route.type, route.encoding, node, converters, self, post
+            self._ros, route.type, route.encoding, self._node, self._converters, self, self._post
         )
 
     def created(self) -> None:
