@@ -1283,11 +1283,17 @@ def test_the_store_knows_what_is_owed(join: Join, broker: Broker, store: FakeSto
     assert isinstance(subscriber.unsubscribe("a"), Unsuback)
 
 
-def test_a_closed_window_holds_up_no_qos_0(join: Join):
-    """v5 [MQTT-3.3.4-8]; a subscription whose retained messages wait does not either"""
+def retain_thirty(join: Join) -> Peer:
+    """Who has published so many retained messages; the payload is their number."""
     publisher = join("publisher")
     for n in range(30):
-        publisher.publish(f"r/{n}", b"retained", 1, retain=True)
+        publisher.publish(f"r/{n}", b"%d" % n, 1, retain=True)
+    return publisher
+
+
+def test_a_closed_window_holds_up_no_qos_0(join: Join):
+    """v5 [MQTT-3.3.4-8]; a subscription whose retained messages wait does not either"""
+    publisher = retain_thirty(join)
     subscriber = join("subscriber")
     subscriber.subscribe("r/+", 1)
     subscriber.subscribe("live")
@@ -1307,9 +1313,7 @@ def test_a_closed_window_holds_up_no_qos_0(join: Join):
 
 def test_retained_messages_wait_for_the_next_connection(join: Join):
     """[MQTT-4.1.0-1]: those of QoS 1 and 2 are part of what the session owes"""
-    publisher = join("publisher")
-    for n in range(30):
-        publisher.publish(f"r/{n}", b"%d" % n, 1, retain=True)
+    retain_thirty(join)
     subscriber = join("subscriber", **lasting(5))
     subscriber.subscribe("r/+", 1)
     assert len(subscriber.messages()) == 20  # lost with the connection
@@ -1319,9 +1323,7 @@ def test_retained_messages_wait_for_the_next_connection(join: Join):
 
 
 def test_unsubscribing_ends_the_retained_messages_too(join: Join):
-    publisher = join("publisher")
-    for n in range(30):
-        publisher.publish(f"r/{n}", b"x", 1, retain=True)
+    retain_thirty(join)
     subscriber = join("subscriber")
     subscriber.subscribe("r/+", 1)
     first = subscriber.messages()
@@ -1332,9 +1334,7 @@ def test_unsubscribing_ends_the_retained_messages_too(join: Join):
 
 def test_what_is_retained_meanwhile_is_what_is_sent(join: Join, broker: Broker):
     """A retained message that waits for its turn is looked up then: the newest, or none."""
-    publisher = join("publisher")
-    for n in range(30):
-        publisher.publish(f"r/{n}", b"old", 1, retain=True)
+    publisher = retain_thirty(join)
     subscriber = join("subscriber")
     subscriber.subscribe("r/+", 1, retain_as_published=True)
     first = subscriber.messages()

@@ -569,14 +569,19 @@ def test_a_smaller_window_holds_for_what_is_sent_again(join: Join, qos):
     assert not peer.session.inflight
 
 
-def test_a_connection_that_is_lost_while_it_is_sent_again(join: Join):
-    """[MQTT-4.4.0-1], twice"""
+def unanswered(join: Join, count: int) -> tuple[Peer, Peer, list[int | None]]:
+    """A client, who publishes to it, and the ids of so many messages that it leaves unanswered."""
     peer = join(**lasting(5))
     peer.subscribe("#", 1)
     publisher = join("publisher")
-    for n in range(10):
+    for n in range(count):
         publisher.publish("a", b"%d" % n, 1)
-    ids = [message.packet_id for message in peer.messages()]
+    return peer, publisher, [message.packet_id for message in peer.messages()]
+
+
+def test_a_connection_that_is_lost_while_it_is_sent_again(join: Join):
+    """[MQTT-4.4.0-1], twice"""
+    peer, _, ids = unanswered(join, 10)
     options = lasting(5)
     options["properties"][P.RECEIVE_MAXIMUM] = 3  # type: ignore[index]
     for _ in range(2):
@@ -590,12 +595,7 @@ def test_a_connection_that_is_lost_while_it_is_sent_again(join: Join):
 
 
 def test_what_waits_to_be_sent_again_may_be_acknowledged(join: Join):
-    peer = join(**lasting(5))
-    peer.subscribe("#", 1)
-    publisher = join("publisher")
-    for n in range(6):
-        publisher.publish("a", b"%d" % n, 1)
-    ids = [message.packet_id for message in peer.messages()]
+    peer, publisher, ids = unanswered(join, 6)
     peer.lose()
     options = lasting(5)
     options["properties"][P.RECEIVE_MAXIMUM] = 1  # type: ignore[index]

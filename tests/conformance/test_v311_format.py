@@ -19,9 +19,9 @@ from client_v311 import (
     refused,
     wire,
 )
+from formats import ILL_FORMED, check_identifiers, packet_ids, packet_names, packets_of
 
 from appliance.broker.broker import Broker
-from appliance.mqtt.packets import Puback, Publish, Pubrec
 
 statement = pytest.mark.statement
 
@@ -51,17 +51,9 @@ STRINGS = [
     pytest.param("filter to unsubscribe", marks=statement("3.1.1", "MQTT-3.10.3-1")),
 ]
 
-ILL_FORMED = {
-    "no first byte": "61 80 62",
-    "no second byte": "61 c3",
-    "no such byte": "ff",
-    "longer than it needs to be": "c0 af",
-    "U+0000 in two bytes": "c0 80",
+MORE_ILL_FORMED = ILL_FORMED | {
     "three bytes for two": "e0 80 af",
-    "U+D800": "ed a0 80",
-    "U+DFFF": "ed bf bf",
     "a pair of surrogates": "ed a0 bd ed b8 80",
-    "above U+10FFFF": "f4 90 80 80",
 }
 
 
@@ -74,7 +66,7 @@ def is_refused(broker: Broker, where: str, text: bytes) -> bool:
 
 
 @statement("3.1.1", "MQTT-1.5.3-1")
-@pytest.mark.parametrize("text", ILL_FORMED.values(), ids=ILL_FORMED)
+@pytest.mark.parametrize("text", MORE_ILL_FORMED.values(), ids=MORE_ILL_FORMED)
 @pytest.mark.parametrize("where", STRINGS)
 def test_ill_formed_utf_8_closes_the_connection(broker: Broker, where: str, text: str) -> None:
     watcher = joined(broker, "watcher")
@@ -132,35 +124,14 @@ def test_a_byte_order_mark_is_part_of_a_client_id(broker: Broker) -> None:
 
 # --- flags of the fixed header
 
-#: What a client sends, without its first byte; and the flags of table 2.2.
-PACKETS = {
-    "CONNECT": (0x10, connect("c")[1:]),
-    "PUBACK": (0x40, wire("02 0001")),
-    "PUBREC": (0x50, wire("02 0001")),
-    "PUBREL": (0x62, wire("02 0001")),
-    "PUBCOMP": (0x70, wire("02 0001")),
-    "SUBSCRIBE": (0x82, wire("06 0001 0001 61 00")),
-    "UNSUBSCRIBE": (0xA2, wire("05 0001 0001 61")),
-    "PINGREQ": (0xC0, wire("00")),
-    "DISCONNECT": (0xE0, wire("00")),
-}
+#: The flags of table 2.2.
+PACKETS = packets_of(
+    connect("c"), subscribe="82 06 0001 0001 61 00", unsubscribe="a2 05 0001 0001 61"
+)
 
 
 @statement("3.1.1", "MQTT-2.2.2-2")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "CONNECT",
-        "PUBACK",
-        "PUBREC",
-        pytest.param("PUBREL", marks=statement("3.1.1", "MQTT-3.6.1-1")),
-        "PUBCOMP",
-        pytest.param("SUBSCRIBE", marks=statement("3.1.1", "MQTT-3.8.1-1")),
-        pytest.param("UNSUBSCRIBE", marks=statement("3.1.1", "MQTT-3.10.1-1")),
-        "PINGREQ",
-        pytest.param("DISCONNECT", marks=statement("3.1.1", "MQTT-3.14.1-1")),
-    ],
-)
+@pytest.mark.parametrize("name", packet_names("3.1.1"))
 def test_wrong_flags_close_the_connection(broker: Broker, name: str) -> None:
     right, rest = PACKETS[name]
     for flags in range(16):
@@ -222,7 +193,7 @@ def test_qos_0_has_no_packet_identifier(broker: Broker) -> None:
 
 
 @statement("3.1.1", "MQTT-2.3.1-6")
-@pytest.mark.parametrize("packet_id", ["0001", "0100", "ffff"])
+@packet_ids
 def test_acknowledgements_have_the_identifier_of_the_publish(
     broker: Broker, packet_id: str
 ) -> None:
@@ -244,7 +215,7 @@ def test_pubrel_has_the_identifier_of_the_publish(broker: Broker) -> None:
 
 
 @statement("3.1.1", "MQTT-2.3.1-7", "MQTT-3.8.4-2", "MQTT-3.10.4-4")
-@pytest.mark.parametrize("packet_id", ["0001", "0100", "ffff"])
+@packet_ids
 def test_suback_and_unsuback_have_the_identifier_of_what_they_answer(
     broker: Broker, packet_id: str
 ) -> None:
@@ -255,22 +226,4 @@ def test_suback_and_unsuback_have_the_identifier_of_what_they_answer(
 
 @statement("3.1.1", "MQTT-2.3.1-1", "MQTT-2.3.1-4", "MQTT-4.3.2-1", "MQTT-4.3.3-1")
 def test_an_identifier_is_used_again_only_after_the_last_acknowledgement(broker: Broker) -> None:
-    receiver, sender = joined(broker, "receiver"), joined(broker, "sender")
-    receiver.subscribe("#", 2)
-    held = []
-    for name in ("no PUBACK", "no PUBREC", "no PUBCOMP"):
-        sender.publish("a", b"", 1 if name == "no PUBACK" else 2)
-        (message,) = receiver.messages()
-        held.append(message.packet_id)
-        if name == "no PUBCOMP":
-            receiver.send(Pubrec(message.packet_id))
-            receiver.received()
-    used = set(held)
-    assert len(used) == 3
-    for _ in range(65535 // 15 + 1):  # once around
-        sender.send(*[Publish("a", b"", 1, packet_id=1)] * 15)
-        ids = [message.packet_id for message in receiver.messages()]
-        assert len(set(ids)) == 15 and not {0, *held}.intersection(ids)
-        receiver.send(*map(Puback, ids))
-        used.update(ids)
-    assert used == set(range(1, 65536))
+    check_identifiers(joined(broker, "receiver"), joined(broker, "sender"))

@@ -22,9 +22,9 @@ from client_v5 import (
     turned_away,
     wire,
 )
+from formats import ILL_FORMED, check_identifiers, packet_ids, packet_names, packets_of
 
 from appliance.broker.broker import Broker
-from appliance.mqtt.packets import Puback, Publish, Pubrec
 
 statement = pytest.mark.statement
 
@@ -83,16 +83,6 @@ STRINGS = [
     "reason string of PUBACK",
     "reason string of DISCONNECT",
 ]
-ILL_FORMED = {
-    "no first byte": "61 80 62",
-    "no second byte": "61 c3",
-    "no such byte": "ff",
-    "longer than it needs to be": "c0 af",
-    "U+0000 in two bytes": "c0 80",
-    "U+D800": "ed a0 80",
-    "U+DFFF": "ed bf bf",
-    "above U+10FFFF": "f4 90 80 80",
-}
 
 
 def is_malformed(broker: Broker, where: str, text: bytes) -> bool:
@@ -219,35 +209,14 @@ def test_a_length_in_more_bytes_than_it_needs_is_malformed(broker: Broker, data:
 
 # --- 2.1.3 flags
 
-#: What a client sends, without its first byte; and the flags of table 2-2.
-PACKETS = {
-    "CONNECT": (0x10, connect("c")[1:]),
-    "PUBACK": (0x40, wire("02 0001")),
-    "PUBREC": (0x50, wire("02 0001")),
-    "PUBREL": (0x62, wire("02 0001")),
-    "PUBCOMP": (0x70, wire("02 0001")),
-    "SUBSCRIBE": (0x82, wire("07 0001 00 0001 61 00")),
-    "UNSUBSCRIBE": (0xA2, wire("06 0001 00 0001 61")),
-    "PINGREQ": (0xC0, wire("00")),
-    "DISCONNECT": (0xE0, wire("00")),
-}
+#: The flags of table 2-2.
+PACKETS = packets_of(
+    connect("c"), subscribe="82 07 0001 00 0001 61 00", unsubscribe="a2 06 0001 00 0001 61"
+)
 
 
 @statement("5.0", "MQTT-2.1.3-1")
-@pytest.mark.parametrize(
-    "name",
-    [
-        "CONNECT",
-        "PUBACK",
-        "PUBREC",
-        pytest.param("PUBREL", marks=statement("5.0", "MQTT-3.6.1-1")),
-        "PUBCOMP",
-        pytest.param("SUBSCRIBE", marks=statement("5.0", "MQTT-3.8.1-1")),
-        pytest.param("UNSUBSCRIBE", marks=statement("5.0", "MQTT-3.10.1-1")),
-        "PINGREQ",
-        pytest.param("DISCONNECT", marks=statement("5.0", "MQTT-3.14.1-1")),
-    ],
-)
+@pytest.mark.parametrize("name", packet_names("5.0"))
 def test_reserved_flags_are_malformed(broker: Broker, name: str) -> None:
     right, rest = PACKETS[name]
     for flags in set(range(16)) - {right & 0x0F}:
@@ -311,7 +280,7 @@ def test_a_packet_identifier_of_0_is_an_error(broker: Broker, without: str, code
 
 
 @statement("5.0", "MQTT-2.2.1-5", "MQTT-4.3.2-4", "MQTT-4.3.3-8", "MQTT-4.3.3-11")
-@pytest.mark.parametrize("packet_id", ["0001", "0100", "ffff"])
+@packet_ids
 def test_acknowledgements_have_the_identifier_of_the_publish(
     broker: Broker, packet_id: str
 ) -> None:
@@ -335,7 +304,7 @@ def test_pubrel_has_the_identifier_of_the_publish(broker: Broker) -> None:
 
 
 @statement("5.0", "MQTT-2.2.1-6", "MQTT-3.8.4-1", "MQTT-3.8.4-2", "MQTT-3.10.4-4", "MQTT-3.10.4-5")
-@pytest.mark.parametrize("packet_id", ["0001", "0100", "ffff"])
+@packet_ids
 def test_suback_and_unsuback_have_the_identifier_of_what_they_answer(
     broker: Broker, packet_id: str
 ) -> None:
@@ -346,24 +315,7 @@ def test_suback_and_unsuback_have_the_identifier_of_what_they_answer(
 
 @statement("5.0", "MQTT-2.2.1-4", "MQTT-4.3.2-1", "MQTT-4.3.3-1")
 def test_an_identifier_is_used_again_only_after_the_last_acknowledgement(broker: Broker) -> None:
-    receiver, sender = joined(broker, "receiver"), joined(broker, "sender")
-    receiver.subscribe("#", 2)
-    held = []
-    for name in ("no PUBACK", "no PUBREC", "no PUBCOMP"):
-        sender.publish("a", b"", 1 if name == "no PUBACK" else 2)
-        (message,) = receiver.messages()
-        held.append(message.packet_id)
-        if name == "no PUBCOMP":
-            assert receiver.say(Pubrec(3).encode(5)) == wire("62 02 0003")
-    assert held == [1, 2, 3]
-    used = set(held)
-    for _ in range(65535 // 15 + 1):  # once around
-        sender.send(*[Publish("a", b"", 1, packet_id=1)] * 15)
-        ids = [message.packet_id for message in receiver.messages()]
-        assert len(set(ids)) == 15 and not {0, *held}.intersection(ids)
-        receiver.send(*map(Puback, ids))
-        used.update(ids)
-    assert used == set(range(1, 65536))
+    check_identifiers(joined(broker, "receiver"), joined(broker, "sender"))
 
 
 # --- 2.2.2 properties

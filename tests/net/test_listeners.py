@@ -376,19 +376,25 @@ def break_packets(protocol: wire.ClientConnection) -> None:
     protocol._client._on_packet = Mock(side_effect=ZeroDivisionError)  # type: ignore[method-assign]
 
 
+async def overwhelm(harness: Harness, receive_buffer: int) -> Peer:
+    """A client, `deaf`, that more was sent to than fits on its way."""
+    await harness.start()
+    deaf = await harness.log_in("deaf", receive_buffer=receive_buffer)
+    await deaf.send(Subscribe(1, [Subscription("a")]))
+    await deaf.receive()
+    publisher = await harness.log_in("pub")
+    for _ in range(10):
+        await publisher.send(Publish("a", bytes(MIB)))
+    return deaf
+
+
 @pytest.mark.parametrize("why", ["wrong bytes", "a fault"])
 async def test_who_does_not_read_the_last_bytes_is_cut_off(
     harness: Harness, monkeypatch, escaped, why
 ):
     """A closed connection does not stay because its output cannot be written."""
     monkeypatch.setattr(wire, "CLOSE_TIMEOUT", 0.2)
-    await harness.start()
-    peer = await harness.log_in("deaf", receive_buffer=8192)
-    await peer.send(Subscribe(1, [Subscription("a")]))
-    await peer.receive()
-    publisher = await harness.log_in("pub")
-    for _ in range(10):
-        await publisher.send(Publish("a", bytes(MIB)))
+    peer = await overwhelm(harness, receive_buffer=8192)
     await until(lambda: not harness.protocol("deaf")._client.output.writable)
     protocol = harness.protocol("deaf")
     if why == "wrong bytes":
@@ -1114,13 +1120,7 @@ async def test_publishers_are_slowed_while_memory_is_short(small_house: Harness,
 
 async def test_who_stays_slow_is_told_in_the_log(harness: Harness, monkeypatch, caplog):
     monkeypatch.setattr(wire, "SLOW_AFTER", 0.05)
-    await harness.start()
-    deaf = await harness.log_in("deaf", receive_buffer=4096)
-    await deaf.send(Subscribe(1, [Subscription("a")]))
-    await deaf.receive()
-    publisher = await harness.log_in("pub")
-    for _ in range(10):
-        await publisher.send(Publish("a", bytes(MIB)))
+    deaf = await overwhelm(harness, receive_buffer=4096)
     await until(lambda: "client 'deaf' (anonymous)" in caplog.text)
     assert "does not read" in caplog.text
     deaf.hang_up()

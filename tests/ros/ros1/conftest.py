@@ -65,15 +65,11 @@ def appliance(
 ) -> Iterator[Ros1Appliance]:
     """It is there before the Master is."""
     process = Ros1Appliance(tmp_path_factory.mktemp("appliance"), python, world, BRIDGE)
-    process.start()
-    try:
+    with process.running():
         process.wait_for_log("waiting for the ROS Master: .*refused")
         world.start()
         process.wait_for_log("on ROS as /appliance", timeout=2 * PATIENCE)
         yield process
-    finally:
-        process.stop()
-        print(process.log)
 
 
 @pytest.fixture(scope="package")

@@ -18,7 +18,8 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
 from typing import Any, cast
@@ -251,6 +252,16 @@ class Ros1Appliance(ApplianceProcess):
         super().__init__(directory, acl=ACL, bridge={"bus": "ros1", **bridge})
         self.python = python.executable
         self.environment = world.environment | {"PYTHONPATH": python.path, "LD_LIBRARY_PATH": ""}
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Start it, and stop it in the end; what it has logged is printed."""
+        self.start()
+        try:
+            yield
+        finally:
+            self.stop()
+            print(self.log)
 
 
 class Mqtt:

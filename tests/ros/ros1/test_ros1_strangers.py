@@ -68,13 +68,9 @@ def appliance(
     python: Python, world: World, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Ros1Appliance]:
     process = Ros1Appliance(tmp_path_factory.mktemp("appliance"), python, world, BRIDGE)
-    process.start()
-    try:
+    with process.running():
         process.wait_for_log("on ROS as /odd_robot/appliance")
         yield process
-    finally:
-        process.stop()
-        print(process.log)
 
 
 def begin(topic: str) -> bytes:
@@ -154,11 +150,8 @@ def test_a_second_node_of_the_same_name_does_not_end_the_first(
     world: World, appliance: Ros1Appliance, python: Python, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     second = Ros1Appliance(tmp_path_factory.mktemp("second"), python, world, BRIDGE)
-    second.start()
-    try:
+    with second.running():
         second.wait_for_log("another node, at .*, is called /odd_robot/appliance: end it, or")
-    finally:
-        second.stop()
     assert "no bridge to ROS" not in appliance.log
 
 
