@@ -32,8 +32,8 @@ _RULES = """
 user {user}
 topic read {{robot}}/events/#
 topic read {{robot}}/_appliance/routes
-# Answers to calls from there; which calls may come takes lines such as the last two:
-topic readwrite {{robot}}/_upstream/{name}/#
+# A call from there is answered below this; which calls and commands may come takes such lines:
+topic write {{robot}}/_upstream/{name}/#
 #topic write {{robot}}/reset/_call/#
 #topic write {{robot}}/cmd_vel
 """

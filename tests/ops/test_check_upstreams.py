@@ -231,7 +231,7 @@ def test_missing_rights_are_told_with_the_line_to_add(here: Path) -> None:
         "topic read x/#",
         "topic write {robot}/mission/#",
         "topic write {robot}/reset/_call",
-        "topic readwrite {robot}/_upstream/fleet/#",
+        "topic write {robot}/_upstream/fleet/#",
     ]
     assert told[2].startswith(
         "warning in mission/#: no rule lets the user 'upstream' write r2/mission/#; add to acl.conf"
@@ -248,6 +248,14 @@ def test_rights_that_are_denied(here: Path) -> None:
     (told,) = troubles(here)
     assert "out events/#: no rule lets the user 'upstream' read r2/events/#" in told
     assert troubles(here, out=[{"topic": "#"}]) == []
+
+
+def test_a_pattern_that_denies_and_names_clients(here: Path) -> None:
+    """The link's client ids are levels of topics: such a pattern is about other topics."""
+    with (here / "acl.conf").open("a") as file:
+        file.write("pattern deny {robot}/private/%c/#\npattern read {robot}/%u/#\n")
+    assert troubles(here, out=[{"topic": "upstream/x"}]) == []
+    assert len(troubles(here, out=[{"topic": "private/_upstream.fleet/x"}])) == 1
 
 
 DRIVE = {"ros": "/cmd_vel", "to": "ros", "expire": "1 s", "on_silence": {"after": "300 ms"}}

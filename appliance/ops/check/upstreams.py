@@ -22,7 +22,7 @@ from appliance.ops.init import call_topics
 from appliance.upstream.answers import new_token
 from appliance.upstream.limits import KINDS, kind_of_host
 from appliance.upstream.rules import InRule, UpstreamSettings
-from appliance.upstream.sessions import in_client_id, out_client_id
+from appliance.upstream.sessions import in_client_id, kept_client_id, out_client_id
 from appliance.upstream.settings import command_filters
 from appliance.upstream.settings import upstreams as links
 
@@ -198,7 +198,10 @@ def _too_long(link: UpstreamSettings) -> Iterator[Finding]:
 def _rights(settings: Settings, link: UpstreamSettings, acl: Acl) -> Iterator[Finding]:
     """The lines that the access rules lack for what the link is to carry."""
     reader = Identity(link.user, out_client_id(link.name))
-    writer = Identity(link.user, in_client_id(link.name))
+    writers = {
+        "drop": Identity(link.user, in_client_id(link.name)),
+        "keep": Identity(link.user, kept_client_id(link.name)),
+    }
     lacking = [
         (f"out {rule.topic}", "read", rule.local_filter)
         for rule in link.out
@@ -207,19 +210,18 @@ def _rights(settings: Settings, link: UpstreamSettings, acl: Acl) -> Iterator[Fi
     lacking += [
         (f"in {rule.topic}", "write", rule.local_filter)
         for rule in link.inward
-        if not acl.allows_some(writer, Action.PUBLISH, rule.local_filter)
+        if not acl.allows_some(writers[rule.offline], Action.PUBLISH, rule.local_filter)
     ]
+    # Who calls names where to be answered, and may do so only where it may publish itself.
     answers = f"{link.answers_here}#"
-    may_answer = acl.allows_some(reader, Action.RECEIVE, answers) and acl.allows_some(
-        writer, Action.PUBLISH, answers
-    )
-    if not may_answer and any(_carries_calls(settings, rule) for rule in link.inward):
-        lacking.append(("answers to calls", "readwrite", answers))
+    calling = [rule for rule in link.inward if _carries_calls(settings, rule)]
+    if not all(acl.allows_some(writers[r.offline], Action.PUBLISH, answers) for r in calling):
+        lacking.append(("answers to calls", "write", answers))
     for what, access, filter in lacking:
         line = f"topic {access} {written(filter, settings.robot)}"
         text = (
-            f"{what}: no rule lets the user {link.user!r} {access.replace('readw', 'read and w')} "
-            f"{filter}; add to {settings.broker.acl.name} below the line `user {link.user}`: {line}"
+            f"{what}: no rule lets the user {link.user!r} {access} {filter}; add to "
+            f"{settings.broker.acl.name} below the line `user {link.user}`: {line}"
         )
         yield Finding("warning", _subject(link), text)
 
