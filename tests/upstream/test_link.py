@@ -379,6 +379,7 @@ def test_what_is_published_is_what_the_codec_encodes(version, qos, retain, size)
         assert fake.link.publish("t", "a/é", payload, qos, retain, encoded(held)) == 0
         expected = Publish("a/é", payload, qos, retain, False, n if qos else None, held)
         assert fake.link.waiting == len(expected.encode(version))
+        assert fake.link.held == fake.link.waiting
         assert b"".join(fake.link.take(0.0)) == expected.encode(version)
     assert fake.link.inflight == 2 * qos
 
