@@ -325,7 +325,7 @@ class Segment:
 
 
 class RecordsLostError(Exception):
-    """A segment's records were damaged on the disk; it has been reported, and can be dropped."""
+    """A segment's records were damaged on the disk; it has been reported and removed."""
 
 
 #: What `Journal.read` calls with the segment's records, or with the reason why there are none.
@@ -366,10 +366,10 @@ class Journal(Protocol):
     def read(self, segment: Segment, callback: RecordsRead) -> None:
         """Pass all `count` records to the callback, in a later round of the event loop.
 
-        They are read in a thread; what is not committed yet comes from memory. After
-        `RecordsLostError` the segment should be dropped; after any other exception, reading may
-        succeed later. For a segment that may still grow, the records of this moment are passed. If
-        the segment is dropped meanwhile, the callback is still called.
+        They are read in a thread; what is not committed yet comes from memory. For a segment that
+        may still grow, the records of this moment are passed; of one that is not among `segments`
+        any more, none. With `RecordsLostError` the segment was removed; after any other exception,
+        reading may succeed later. After the store is closed, nothing is called any more.
         """
 
     def release(self, segment: Segment) -> None:
