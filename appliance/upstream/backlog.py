@@ -1,0 +1,1136 @@
+"""What waits for one link: it is accepted here, handed out in order, and kept until settled.
+
+Pure: time is an argument, in seconds of the journals' clock (`Journal.now`), and what is stored
+goes through the ports in `broker/ports.py`. Each rule has a `RuleQueue`; this module decides which
+of them is next, what is dropped when the backlog is full, and what is in memory:
+
+- messages that were handed out, at most `IN_FLIGHT_SIZE` bytes;
+- the next ones of each journal, `LOADED_SIZE` for all rules; the others are on disk alone;
+- the latest ones of topics, and those that are forgotten when the connection ends, `LIVE_SIZE`.
+
+A single message may exceed each of these, as it could not be sent otherwise.
+
+Each message that was offered is in the end sent, dropped for a reason, or set aside:
+`offered + restored = sent + dropped + set aside + waiting`, see `BacklogCounts`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import logging
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import partial
+from typing import Final
+
+from appliance.broker.ports import Backlogs, RecordsLostError, Segment
+from appliance.upstream.rates import TokenBucket
+from appliance.upstream.records import Record, encode_record, record_times
+from appliance.upstream.rule_queue import (
+    AGAIN,
+    ENTRY_OVERHEAD,
+    GONE,
+    IN_FLIGHT,
+    LATER,
+    LATEST_OVERHEAD,
+    LOADED_OVERHEAD,
+    Entry,
+    HeldSegment,
+    RuleQueue,
+    size_left,
+)
+from appliance.upstream.rules import PRIORITIES, BacklogLimits, OutRule
+from appliance.upstream.set_aside import AsideRecords, SetAside
+
+log = logging.getLogger(__name__)
+
+KIB: Final = 1024
+MIB: Final = 1024 * KIB
+
+#: Bytes of memory: of messages in flight, of records that were read, of those that are in memory
+#: for other reasons. With what a higher lane gets in addition it is 8 MiB a link.
+IN_FLIGHT_SIZE: Final = 3 * MIB
+LOADED_SIZE: Final = 5 * MIB // 4
+LIVE_SIZE: Final = 7 * MIB // 2
+
+#: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
+#: higher lane would wait for all of them.
+IN_FLIGHT_RESERVE: Final = 256 * KIB
+
+#: Bytes of read records that a rule has at least, however many rules there are.
+LOADED_SHARE: Final = 32 * KIB
+
+#: After so many messages of other lanes it is a lane's turn. Both lower lanes may have waited, so
+#: that each gets one in 16.
+TURN: Final = 14
+
+#: Messages that wait to be tried again (0x97); with more, nothing else is sent until one is due.
+MOST_LATER: Final = 100
+
+#: Seconds until a message is tried again; doubled each time up to the second value.
+FIRST_RETRY: Final = 1.0
+LONGEST_RETRY: Final = 60.0
+
+#: Seconds after which a message says when it was published.
+DELAYED: Final = 1.0
+
+#: Seconds until a segment is read again that could not be read.
+READ_AGAIN: Final = 1.0
+
+#: Expired messages that one call of `next` drops: some milliseconds.
+MOST_DROPPED: Final = 1000
+
+#: The largest Message Expiry Interval, in seconds.
+_LONGEST_EXPIRY: Final = 0xFFFF_FFFF
+
+# The first byte of rows in the table of latest records.
+_LATEST: Final = b"L"
+_LATER: Final = b"R"
+_NUMBERS: Final = b"N"
+
+
+class DropReason(Enum):
+    """Why a message is not sent."""
+
+    FULL = "full"  # the backlog, or its part of the memory
+    REFUSED = "refused"  # as it is full; the publisher was told
+    STORE = "store"  # nothing can be stored now; the publisher was told
+    AGE = "age"
+    EXPIRED = "expired"
+    REPLACED = "replaced"  # by a newer one of its topic
+    OFFLINE = "offline"  # its rule keeps nothing without a connection
+    UNREADABLE = "unreadable"  # damaged on the disk
+
+
+@dataclass(slots=True)
+class BacklogCounts:
+    """What has happened to messages since the start, and what waits now.
+
+    `waiting` includes those `in_flight`, and so do `bytes`. `oldest_at` is when the oldest of them
+    was published, in seconds of the journals' clock. `restored` waited at the start. `dropped` is
+    by rule and reason; of those that were set aside, `aside` are kept.
+    """
+
+    offered: int = 0
+    restored: int = 0
+    sent: int = 0
+    set_aside: int = 0
+    dropped: Counter[tuple[str, DropReason]] = field(default_factory=Counter)
+    waiting: int = 0
+    in_flight: int = 0
+    bytes: int = 0
+    lanes: tuple[int, int, int] = (0, 0, 0)
+    oldest_at: float | None = None
+    aside: int = 0
+
+
+class Backlog:
+    """What waits for one link.
+
+    `wake` is called when `next` may have something again after it had nothing, once; it must not
+    call back, but see to it that somebody does. After `settle`, `set_aside` and `retry_later`, and
+    at the time that `due` says, `next` is to be called anyway.
+
+    A connection begins with `connected` and ends with `rewind`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        backlogs: Backlogs,
+        rules: Iterable[OutRule],
+        limits: BacklogLimits,
+        now: float,
+        wake: Callable[[], None],
+        *,
+        rate: float | None = None,
+        bytes_per_second: float | None = None,
+    ) -> None:
+        self._name = name
+        self._backlogs = backlogs
+        self._latest = backlogs.latest(name)
+        self._wake = wake
+        self._limits = limits
+        self._bucket: TokenBucket | None = None
+        self._byte_bucket: TokenBucket | None = None
+        #: Numbers grow through restarts, as no link has a million messages a second.
+        self._number = int(now * 1e6)
+        self._online = False
+        #: Whether `next` had nothing and nobody was woken since.
+        self._idle = True
+
+        self._queues: dict[str, RuleQueue] = {}
+        #: By the identity of each of these rules, which is faster than the value.
+        self._rules: list[OutRule] = []
+        self._of_rule: dict[int, RuleQueue] = {}
+        self._lanes: list[list[RuleQueue]] = [[] for _ in PRIORITIES]
+        #: By lane: messages of other lanes since its last one, and whether `live` is next.
+        self._passed = [0] * len(PRIORITIES)
+        self._live_first = [False] * len(PRIORITIES)
+        #: Bytes of read records that each rule may have in memory.
+        self._share = LOADED_SIZE
+        #: The rule that has a record in memory which exceeds its share.
+        self._oversized: RuleQueue | None = None
+
+        self._messages = 0
+        self._bytes = 0
+        #: Handed out and not settled, by number, in this order.
+        self._flying: dict[int, Entry] = {}
+        #: Bytes of memory: in flight, to be sent again, and of `latest` and `live`.
+        self._flying_size = 0
+        self._again_size = 0
+        self._live_size = 0
+        #: To be tried again: when, number, entry; and how many of them are not GONE.
+        self._later: list[tuple[float, int, Entry]] = []
+        self._later_count = 0
+        #: Numbers of messages that were stored by themselves and may be in a journal as well, as
+        #: what was settled there out of order was not stored.
+        self._repeated: set[int] = set()
+        self._full_since: int | None = None
+        self._counts = BacklogCounts()
+
+        #: By rule: the number of its journal; and the key of the row that says so.
+        self._numbers: dict[str, int] = {}
+        self._numbers_key: int | None = None
+        self._aside = AsideRecords(backlogs.aside(name))
+        self._follow(rules, rate, bytes_per_second, now)
+        self._restore()
+        self._sort()
+
+    # --- rules ------------------------------------------------------------------------------------
+
+    def replace_rules(
+        self,
+        rules: Iterable[OutRule],
+        limits: BacklogLimits,
+        now: float,
+        *,
+        rate: float | None = None,
+        bytes_per_second: float | None = None,
+    ) -> None:
+        """Follow other rules and limits from now on.
+
+        What waits for a rule that is no more is sent nevertheless.
+        """
+        self._limits = limits
+        self._follow(rules, rate, bytes_per_second, now)
+        self._forget_drained()
+        self._sort()
+
+    def _follow(
+        self,
+        rules: Iterable[OutRule],
+        rate: float | None,
+        bytes_per_second: float | None,
+        now: float,
+    ) -> None:
+        self._bucket = _bucket(self._bucket, rate, now)
+        self._byte_bucket = _bucket(self._byte_bucket, bytes_per_second, now)
+        for queue in self._queues.values():
+            queue.configured = False
+        self._rules = list(rules)
+        self._of_rule.clear()
+        for rule in self._rules:
+            self._of_rule[id(rule)] = self._configure(rule, now)
+
+    def _configure(self, rule: OutRule, now: float) -> RuleQueue:
+        name = rule.local_filter
+        queue = self._queues.get(name)
+        if queue is None:
+            queue = self._queues[name] = RuleQueue(rule)
+        elif not queue.configured:
+            queue.use(rule)
+        queue.configured = True
+        queue.bucket = _bucket(queue.bucket, queue.rule.rate, now)
+        return queue
+
+    def _sort(self) -> None:
+        for queues in self._lanes:
+            queues.clear()
+        for queue in self._queues.values():
+            self._lanes[queue.lane].append(queue)
+        self._share = max(LOADED_SHARE, LOADED_SIZE // max(1, len(self._queues)))
+
+    def _forget_drained(self) -> None:
+        """Forget rules that are no more and for which nothing waits."""
+        drained = [each for each in self._queues.values() if not each.configured]
+        drained = [each for each in drained if not each.messages]
+        for queue in drained:
+            del self._queues[queue.name]
+            self._numbers.pop(queue.name, None)
+        if any(queue.number >= 0 for queue in drained):
+            self._put_numbers()
+        if drained:
+            self._sort()
+
+    def _put_numbers(self) -> None:
+        row = _NUMBERS + json.dumps(self._numbers).encode()
+        self._numbers_key = self._latest.put(self._numbers_key, row, awaited=False)
+
+    def _open_journal(self, queue: RuleQueue) -> None:
+        """Give the rule a journal; the number of it is stored before the first record."""
+        number = self._numbers.get(queue.name)
+        if number is None:
+            number = 1 + max(self._numbers.values(), default=-1)
+            self._numbers[queue.name] = number
+            self._put_numbers()
+        queue.number = number
+        queue.journal = self._backlogs.journal(self._name, number)
+
+    # --- what was stored ------------------------------------------------------------------------
+
+    def _restore(self) -> None:
+        later: list[tuple[Record, int, int]] = []
+        for key, row in self._latest.load():
+            try:
+                self._restore_row(key, row, later)
+            except ValueError as error:
+                log.warning("backlog of %s: a row is unreadable: %s", self._name, error)
+                self._latest.remove(key)
+        for name in self._numbers:
+            queue = self._orphaned(name)
+            self._open_journal(queue)
+            assert queue.journal is not None
+            segments = queue.journal.segments()
+            queue.stored = sum(segment.count - segment.done for segment in segments)
+            self._count(queue, queue.stored, sum(map(size_left, segments)))
+            queue.behind = queue.stored > 0
+        for record, size, key in sorted(later, key=lambda each: each[0].number):
+            entry = Entry(self._orphaned(record.rule), record, size)
+            entry.key = key
+            self._count(entry.queue, 1, size)
+            entry.state = AGAIN
+            self._again_size += size + ENTRY_OVERHEAD
+            entry.queue.again.append(entry)
+            self._repeated.add(record.number)
+        for queue in self._queues.values():
+            by_number = sorted(queue.latest.items(), key=lambda each: record_times(each[1][0])[0])
+            queue.latest.clear()
+            queue.latest.update(by_number)
+        self._counts.restored = self._messages
+
+    def _restore_row(self, key: int, row: bytes, later: list[tuple[Record, int, int]]) -> None:
+        kind, data = row[:1], row[1:]
+        if kind == _NUMBERS:
+            self._numbers_key = key
+            self._numbers = _decode_numbers(data)
+            return
+        if kind not in (_LATEST, _LATER):
+            raise ValueError("of another version")
+        record = Record.decode(data)
+        if kind == _LATER:
+            later.append((record, len(data), key))
+            return
+        queue = self._orphaned(record.rule)
+        before = queue.latest.pop(record.topic, None)
+        if before is not None:  # a rule's rows have one topic each, unless it was damaged
+            self._remove_latest(queue, record.topic, before)
+        self._keep_latest(queue, record.topic, data, key)
+        self._count(queue, 1, len(data))
+
+    def _orphaned(self, name: str) -> RuleQueue:
+        """The queue of a rule that may not be in the configuration any more."""
+        queue = self._queues.get(name)
+        if queue is None:
+            queue = self._queues[name] = RuleQueue(OutRule(name, "", ""))
+            queue.configured = False
+        return queue
+
+    # --- in ---------------------------------------------------------------------------------------
+
+    def offer(
+        self,
+        rule: OutRule,
+        topic: str,
+        payload: bytes,
+        qos: int,
+        retain: bool,
+        properties_wire: bytes,
+        expires_at: float | None,
+        now: float,
+    ) -> str | None:
+        """Accept a message for the topic there; returns None, or why it is refused (0x97).
+
+        It may be dropped, now or later, as the limits say. What is stored is part of the store's
+        open batch. `expires_at` is in seconds of the journals' clock.
+        """
+        queue = self._of_rule.get(id(rule)) or self._queue_of(rule, now)
+        kept = queue.kept[2 * qos + retain]
+        self._counts.offered += 1
+        if kept == "none" and not self._online:
+            self._drop(queue, DropReason.OFFLINE)
+            return None
+        self._number = number = self._number + 1
+        data = encode_record(
+            number,
+            queue.encoded_name,
+            topic,
+            payload,
+            qos,
+            retain,
+            now,
+            expires_at,
+            properties_wire,
+        )
+        size = len(data)
+        while self._bytes + size > self._limits.size:
+            replaced = queue.latest.get(topic) if kept == "latest" else None
+            added = size - len(replaced[0]) if replaced is not None else size
+            if self._bytes + added <= self._limits.size:
+                break
+            if not self._make_room(queue.lane, added, now):
+                return self._refuse(queue)
+        if kept == "latest" and qos and queue.may_store(topic):
+            kept = "all"  # it may not overtake an older message of its topic
+        if kept == "all":
+            if self._backlogs.failing:
+                return self._cannot_store(queue, qos)
+            if queue.latest and topic in queue.latest:
+                self._move_latest(queue, topic)
+            self._append(queue, topic, data, number, awaited=qos > 0)
+        elif kept == "latest":
+            if (qos or retain) and self._backlogs.failing:
+                return self._cannot_store(queue, qos)
+            if not self._offer_latest(queue, topic, data, persistent=qos > 0 or retain, qos=qos):
+                self._drop(queue, DropReason.FULL)
+                return None
+        else:
+            memory = size + LOADED_OVERHEAD
+            if not self._make_live_room(queue.lane, memory):
+                self._drop(queue, DropReason.FULL)
+                return None
+            self._live_size += memory
+            queue.live.append(data)
+        queue.messages += 1
+        queue.bytes += size
+        self._messages += 1
+        self._bytes += size
+        if self._idle:
+            self._idle = False
+            self._wake()
+        return None
+
+    def _queue_of(self, rule: OutRule, now: float) -> RuleQueue:
+        """The queue of an equal rule, or of one that is new."""
+        queue = self._queues.get(rule.local_filter)
+        if queue is None or not queue.configured:
+            queue = self._configure(rule, now)
+            self._sort()
+        return queue
+
+    def _refuse(self, queue: RuleQueue) -> str | None:
+        if self._limits.when_full == "refuse":
+            self._drop(queue, DropReason.REFUSED)
+            self._say_full()
+            return f"the backlog of {self._name} is full"
+        self._drop(queue, DropReason.FULL)
+        self._say_full()
+        return None
+
+    def _cannot_store(self, queue: RuleQueue, qos: int) -> str | None:
+        self._drop(queue, DropReason.STORE)
+        return f"the backlog of {self._name} cannot be stored" if qos else None
+
+    def _append(
+        self, queue: RuleQueue, topic: str, data: bytes, number: int, *, awaited: bool
+    ) -> None:
+        journal = queue.journal
+        if journal is None:
+            self._open_journal(queue)
+            journal = queue.journal
+            assert journal is not None
+        segment = journal.append(data, awaited=awaited)
+        queue.stored += 1
+        if queue.mixed:
+            queue.note_topic(topic, number)
+        size = len(data)
+        if not queue.behind and self._has_memory(queue, size):
+            queue.keep(segment, data)
+        elif queue.arriving is not None and queue.arriving_size + size <= self._share:
+            queue.arriving.append((segment, segment.count - 1, data))
+            queue.arriving_size += size + LOADED_OVERHEAD
+            queue.spill(segment)
+        else:
+            queue.arriving = None
+            queue.spill(segment)
+
+    def _has_memory(self, queue: RuleQueue, size: int) -> bool:
+        """Whether a record of this size may be read now."""
+        if queue.loaded + size + LOADED_OVERHEAD <= self._share:
+            return True
+        if queue.waiting or self._oversized is not None:
+            return False
+        self._oversized = queue
+        return True
+
+    # --- the latest of a topic --------------------------------------------------------------------
+
+    def _offer_latest(
+        self, queue: RuleQueue, topic: str, data: bytes, *, persistent: bool, qos: int
+    ) -> bool:
+        """Keep it as the latest of its topic, in place of an older one; False without memory."""
+        key: int | None = None
+        place = queue.latest.get(topic)
+        if place is not None:
+            key = place[1]
+            self._uncount(queue, len(place[0]))
+            self._live_size -= len(place[0]) + LATEST_OVERHEAD
+            self._drop(queue, DropReason.REPLACED)
+        elif topic in queue.newest:
+            before = queue.newest[topic]
+            key, before.key = before.key, None  # the row becomes the newer message's
+            if before.state in (AGAIN, LATER):
+                self._discard(before, DropReason.REPLACED)
+        if not self._make_live_room(queue.lane, len(data) + LATEST_OVERHEAD, queue, topic):
+            queue.latest.pop(topic, None)
+            if key is not None:
+                self._latest.remove(key)
+            return False
+        if persistent or key is not None:
+            key = self._latest.put(key, _LATEST + data, awaited=qos > 0)
+        self._keep_latest(queue, topic, data, key)
+        return True
+
+    def _keep_latest(self, queue: RuleQueue, topic: str, data: bytes, key: int | None) -> None:
+        queue.latest[topic] = data, key
+        self._live_size += len(data) + LATEST_OVERHEAD
+
+    def _remove_latest(self, queue: RuleQueue, topic: str, place: tuple[bytes, int | None]) -> None:
+        """It is not in `latest` any more: end its row and its count."""
+        data, key = place
+        self._live_size -= len(data) + LATEST_OVERHEAD
+        self._uncount(queue, len(data))
+        if key is not None:
+            self._latest.remove(key)
+
+    def _move_latest(self, queue: RuleQueue, topic: str) -> None:
+        """A message that waits as the latest of its topic becomes one of all: more follow it."""
+        data, key = queue.latest[topic]
+        record = Record.decode(data)
+        if not record.qos:
+            return  # MQTT orders messages of a topic and a QoS
+        del queue.latest[topic]
+        self._live_size -= len(data) + LATEST_OVERHEAD
+        self._append(queue, topic, data, record.number, awaited=True)
+        if key is not None:
+            self._latest.remove(key)
+
+    # --- full -------------------------------------------------------------------------------------
+
+    def _make_room(self, lane: int, size: int, now: float) -> bool:
+        """Drop until a message of the lane has room: too old ones, then the lowest lane's oldest.
+
+        Whatever is more urgent than the message stays.
+        """
+        limit = self._limits.size - size
+        if limit < 0:
+            return False
+        for queue in self._queues.values():
+            self._drop_outdated(queue, now)
+        if self._bytes <= limit:
+            return True
+        if self._limits.when_full == "refuse":
+            return False
+        self._say_full()
+        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
+            while self._bytes > limit and self._drop_oldest(lowest):
+                pass
+        return self._bytes <= limit
+
+    def _drop_oldest(self, lane: int) -> bool:
+        """Drop the oldest message of a lane, or the oldest segment on disk; False without any."""
+        oldest = math.inf
+        found: RuleQueue | None = None
+        is_live = False
+        for queue in self._lanes[lane]:
+            stored = queue.oldest_stored()
+            if stored is not None and stored < oldest:
+                oldest, found, is_live = stored, queue, False
+            live = queue.oldest_live()
+            if live is not None and live < oldest:
+                oldest, found, is_live = live, queue, True
+        if found is None:
+            return False
+        if is_live:
+            self._drop_first_live(found, DropReason.FULL)
+        else:
+            self._drop_first_stored(found, DropReason.FULL)
+        return True
+
+    def _drop_first_stored(self, queue: RuleQueue, reason: DropReason) -> None:
+        """Drop what is the first of `again`, of `waiting` or of what is not read."""
+        queue.skip_gone()
+        if queue.again:
+            self._discard(queue.again.popleft(), reason)
+        elif queue.waiting:
+            data, part, index = self._pop_waiting(queue)
+            self._uncount(queue, len(data))
+            self._drop(queue, reason)
+            queue.settle(part, index)
+            self._check_emptied(queue)
+        else:
+            self._drop_unread(queue, queue.unread(), reason)
+
+    def _drop_unread(self, queue: RuleQueue, segment: Segment | None, reason: DropReason) -> None:
+        count, size = queue.drop_unread(segment)
+        self._count(queue, -count, -size)
+        self._drop(queue, reason, count)
+        self._check_emptied(queue)
+
+    def _drop_first_live(self, queue: RuleQueue, reason: DropReason) -> None:
+        if queue.latest:
+            topic, place = queue.latest.popitem(last=False)
+            self._remove_latest(queue, topic, place)
+        else:
+            data = queue.live.popleft()
+            self._live_size -= len(data) + LOADED_OVERHEAD
+            self._uncount(queue, len(data))
+        self._drop(queue, reason)
+
+    def _make_live_room(
+        self, lane: int, memory: int, sparing: RuleQueue | None = None, topic: str = ""
+    ) -> bool:
+        """Drop what is only in memory, or the latest of topics, until so many bytes have room.
+
+        As for `_make_room`. The place of the topic, whose message is being replaced, is kept.
+        """
+        if self._live_size + memory <= LIVE_SIZE:
+            return True
+        if sparing is not None and topic in sparing.latest:
+            del sparing.latest[topic]
+        self._say_full()
+        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
+            while self._live_size and self._live_size + memory > LIVE_SIZE:
+                waiting = [queue for queue in self._lanes[lowest] if queue.latest or queue.live]
+                if not waiting:
+                    break
+                oldest = min(waiting, key=lambda queue: queue.oldest_live() or 0.0)
+                self._drop_first_live(oldest, DropReason.FULL)
+        return not self._live_size or self._live_size + memory <= LIVE_SIZE
+
+    def _say_full(self) -> None:
+        """Log that messages are dropped, once until what waits is half as much."""
+        if self._full_since is None:
+            self._full_since = self._dropped_as_full()
+            what = (
+                "messages are refused"
+                if self._limits.when_full == "refuse"
+                else "the oldest messages of the lowest lane are dropped"
+            )
+            log.warning(
+                "the backlog of %s is full (%d messages, %d bytes): %s",
+                self._name,
+                self._messages,
+                self._bytes,
+                what,
+            )
+
+    def _dropped_as_full(self) -> int:
+        dropped = self._counts.dropped.items()
+        full = (DropReason.FULL, DropReason.REFUSED)
+        return sum(count for (_, reason), count in dropped if reason in full)
+
+    def tick(self, now: float) -> None:
+        """Drop what has become too old; to be called every second or so."""
+        for queue in self._queues.values():
+            self._drop_outdated(queue, now)
+            for topic in [each for each, place in queue.latest.items() if self._why(place[0], now)]:
+                place = queue.latest.pop(topic)
+                self._remove_latest(queue, topic, place)
+                reason = self._why(place[0], now)
+                assert reason is not None
+                self._drop(queue, reason)
+        self._forget_drained()
+        if self._full_since is not None and 2 * self._bytes < self._limits.size:
+            count = self._dropped_as_full() - self._full_since
+            self._full_since = None
+            log.warning(
+                "the backlog of %s has room again; %d messages were dropped or refused",
+                self._name,
+                count,
+            )
+
+    def _drop_outdated(self, queue: RuleQueue, now: float) -> None:
+        """Drop what is too old or expired, from the front of the queue."""
+        while True:
+            queue.skip_gone()
+            if queue.again:
+                record = queue.again[0].record
+                reason = self._too_old(record.stored_at, record.expires_at, now)
+            elif queue.waiting:
+                reason = self._why(queue.waiting[0], now)
+            else:
+                segment = queue.unread() if queue.behind else None
+                age = self._limits.age
+                if segment is None or age is None or segment.last_at + age > now:
+                    break
+                reason = DropReason.AGE
+            if reason is None:
+                break
+            self._drop_first_stored(queue, reason)
+        while queue.live and (reason := self._why(queue.live[0], now)):
+            data = queue.live.popleft()
+            self._live_size -= len(data) + LOADED_OVERHEAD
+            self._uncount(queue, len(data))
+            self._drop(queue, reason)
+
+    def _why(self, data: bytes, now: float) -> DropReason | None:
+        """Why an encoded record is not to be sent any more, if so."""
+        _, stored_at, expires_at = record_times(data)
+        return self._too_old(stored_at, expires_at, now)
+
+    def _too_old(self, stored_at: float, expires_at: float | None, now: float) -> DropReason | None:
+        if expires_at is not None and expires_at <= now:
+            return DropReason.EXPIRED
+        age = self._limits.age
+        return DropReason.AGE if age is not None and stored_at + age <= now else None
+
+    # --- out --------------------------------------------------------------------------------------
+
+    def connected(self) -> None:
+        """A connection can be sent messages from now on."""
+        self._online = True
+
+    def next(self, now: float) -> Entry | None:
+        """The next message to be sent; None when there is none, or when it may not be sent yet.
+
+        It is in flight until it is settled, set aside, tried again or rewound; what is sent with
+        QoS 0 is to be settled at once.
+        """
+        only_again = False
+        size = self._flying_size + self._again_size
+        if size >= IN_FLIGHT_SIZE:
+            if not self._again_size:
+                return None
+            only_again = size >= IN_FLIGHT_SIZE + IN_FLIGHT_RESERVE
+        bucket, byte_bucket = self._bucket, self._byte_bucket
+        if bucket is not None and bucket.due(now) > now:
+            return None
+        if byte_bucket is not None and byte_bucket.due(now) > now:
+            return None
+        if self._later_count:
+            entry = self._next_later(now)
+            if entry is not None or self._later_count >= MOST_LATER:
+                return entry
+        passed = self._passed
+        turn = 2 if passed[2] >= TURN else 1 if passed[1] >= TURN else 0
+        entry = None
+        if turn:
+            passed[turn] = 0
+            entry = self._next_of(turn, now, only_again)
+        if entry is None:
+            entry = (
+                self._next_of(0, now, only_again)
+                or self._next_of(1, now, only_again)
+                or self._next_of(2, now, only_again)
+            )
+        if entry is None:
+            self._idle = True
+            return None
+        lane = entry.queue.lane
+        passed[1] = passed[1] + 1 if lane != 1 else 0
+        passed[2] = passed[2] + 1 if lane != 2 else 0
+        return entry
+
+    def _next_of(self, lane: int, now: float, only_again: bool) -> Entry | None:
+        """The next message of a lane, handed out; it drops those that are too old."""
+        for _ in range(MOST_DROPPED):
+            stored: RuleQueue | None = None
+            live: RuleQueue | None = None
+            for queue in self._lanes[lane]:
+                if not queue.messages:
+                    continue
+                bucket = queue.bucket
+                if bucket is not None and bucket.due(now) > now:
+                    continue
+                again = queue.again
+                if again and again[0].state == GONE:
+                    queue.skip_gone()
+                if only_again and not again:
+                    continue
+                if queue.behind and queue.reading is None and 2 * queue.loaded <= self._share:
+                    self._read_on(queue, now)
+                if (again or queue.waiting) and (
+                    stored is None or queue.first_number() < stored.first_number()
+                ):
+                    stored = queue
+                if (queue.latest or queue.live) and (
+                    live is None or queue.first_live_number() < live.first_live_number()
+                ):
+                    live = queue
+            if live is not None and (stored is None or self._live_first[lane]):
+                self._live_first[lane] = False
+                entry = self._take_live(live, now)
+            elif stored is not None:
+                self._live_first[lane] = True
+                entry = self._take_stored(stored, now)
+            else:
+                return None
+            if entry is not None:
+                return entry
+        self._wake()  # the rest in another turn
+        return None
+
+    def _take_stored(self, queue: RuleQueue, now: float) -> Entry | None:
+        if queue.again:
+            entry = queue.again.popleft()
+            record = entry.record
+            reason = self._too_old(record.stored_at, record.expires_at, now)
+            if reason is not None:
+                self._discard(entry, reason)
+                return None
+            self._again_size -= entry.size + ENTRY_OVERHEAD
+            return self._hand_out(entry, now)
+        data, part, index = self._pop_waiting(queue)
+        try:
+            record = Record.decode(data)
+            reason = self._too_old(record.stored_at, record.expires_at, now)
+        except ValueError as error:
+            log.warning("backlog of %s: a message is unreadable: %s", self._name, error)
+            reason = DropReason.UNREADABLE
+        if reason is not None:
+            self._uncount(queue, len(data))
+            self._drop(queue, reason)
+            queue.settle(part, index)
+            self._check_emptied(queue)
+            return None
+        if record.number in self._repeated:
+            self._repeated.remove(record.number)
+            self._counts.restored -= 1
+            self._uncount(queue, len(data))
+            queue.settle(part, index)
+            self._check_emptied(queue)
+            return None
+        entry = Entry(queue, record, len(data))
+        entry.part = part
+        entry.index = index
+        return self._hand_out(entry, now)
+
+    def _take_live(self, queue: RuleQueue, now: float) -> Entry | None:
+        if queue.latest:
+            topic, place = queue.latest.popitem(last=False)
+            data, key = place
+            reason = self._why(data, now)
+            if reason is not None:
+                self._remove_latest(queue, topic, place)
+                self._drop(queue, reason)
+                return None
+            self._live_size -= len(data) + LATEST_OVERHEAD
+            entry = Entry(queue, Record.decode(data), len(data))
+            entry.key = key
+            entry.topic = topic
+            queue.newest[topic] = entry
+            if key is None:
+                entry.qos = min(1, entry.record.qos)
+            return self._hand_out(entry, now)
+        data = queue.live.popleft()
+        self._live_size -= len(data) + LOADED_OVERHEAD
+        reason = self._why(data, now)
+        if reason is not None:
+            self._uncount(queue, len(data))
+            self._drop(queue, reason)
+            return None
+        entry = Entry(queue, Record.decode(data), len(data))
+        entry.qos = min(1, entry.record.qos)
+        return self._hand_out(entry, now)
+
+    def _hand_out(self, entry: Entry, now: float) -> Entry:
+        record = entry.record
+        entry.state = IN_FLIGHT
+        entry.attempts += 1
+        stored_at = record.stored_at
+        entry.published_at = stored_at if now - stored_at > DELAYED else None
+        if record.expires_at is not None:
+            # Rounded up: 0 would be "at once", or "never", depending on the receiver.
+            entry.expiry = min(_LONGEST_EXPIRY, math.ceil(record.expires_at - now))
+        size = entry.size
+        self._flying[record.number] = entry
+        self._flying_size += size + ENTRY_OVERHEAD
+        if entry.queue.bucket is not None:
+            entry.queue.bucket.take(1)
+        if self._bucket is not None:
+            self._bucket.take(1)
+        if self._byte_bucket is not None:
+            self._byte_bucket.take(size)
+        return entry
+
+    def _next_later(self, now: float) -> Entry | None:
+        """A message that is to be tried again now."""
+        later = self._later
+        while later and (later[0][0] <= now or later[0][2].state != LATER):
+            entry = heapq.heappop(later)[2]
+            if entry.state != LATER:
+                continue
+            self._later_count -= 1
+            record = entry.record
+            reason = self._too_old(record.stored_at, record.expires_at, now)
+            if reason is None:
+                self._again_size -= entry.size + ENTRY_OVERHEAD
+                return self._hand_out(entry, now)
+            entry.state = AGAIN
+            self._discard(entry, reason)
+        return None
+
+    def due(self, now: float) -> float | None:
+        """When `next` has something that it may not hand out now; None if that is unknown."""
+        times = [
+            bucket.due(now) for bucket in (self._bucket, self._byte_bucket) if bucket is not None
+        ]
+        blocked = max(times, default=now)
+        if blocked > now:
+            return blocked if self._messages > len(self._flying) else None
+        while self._later and self._later[0][2].state != LATER:
+            heapq.heappop(self._later)
+        times = [due for due, _, _ in self._later[:1]]
+        for queue in self._queues.values():
+            times.append(queue.read_at)
+            if queue.bucket is not None and queue.messages:
+                times.append(queue.bucket.due(now))
+        return min((due for due in times if due > now), default=None)
+
+    # --- reading ----------------------------------------------------------------------------------
+
+    def _read_on(self, queue: RuleQueue, now: float) -> None:
+        """Read the next segment of a rule's journal, if there is memory for it."""
+        if queue.read_failed:
+            queue.read_failed = False
+            queue.read_at = now + READ_AGAIN
+        if queue.read_at > now:
+            return
+        segment = queue.unread()
+        if segment is None:
+            queue.behind = False
+            return
+        if segment.size > self._share and segment.count == 1 and self._oversized is not None:
+            return
+        queue.start_reading(segment)
+        assert queue.journal is not None
+        queue.journal.read(segment, partial(self._was_read, queue, segment))
+
+    def _was_read(
+        self, queue: RuleQueue, segment: Segment, outcome: list[bytes] | Exception
+    ) -> None:
+        if queue.reading is not segment:
+            return  # it was dropped meanwhile
+        arrived = queue.stop_reading()
+        if isinstance(outcome, RecordsLostError):
+            self._drop_unread(queue, segment, DropReason.UNREADABLE)
+        elif isinstance(outcome, Exception):
+            if not queue.read_at:
+                log.warning("backlog of %s: cannot be read: %s", self._name, outcome)
+            queue.read_failed = True
+        else:
+            queue.read_at = 0.0
+            self._keep_read(queue, segment, outcome, arrived)
+        if self._idle:
+            self._idle = False
+            self._wake()
+
+    def _keep_read(
+        self,
+        queue: RuleQueue,
+        segment: Segment,
+        records: list[bytes],
+        arrived: list[tuple[Segment, int, bytes]],
+    ) -> None:
+        """Keep of a segment what the memory allows, and what was appended while it was read."""
+        first, underestimated = queue.begin(segment, records)
+        self._count(queue, 0, underestimated)
+        for data in records[first:]:
+            if not self._has_memory(queue, len(data)):
+                return
+            queue.keep(segment, data)
+        for place, index, data in arrived:
+            if place is segment and index < len(records):
+                continue
+            if not self._has_memory(queue, len(data)):
+                return
+            queue.keep(place, data)
+        queue.behind = queue.unread() is not None
+
+    def _pop_waiting(self, queue: RuleQueue) -> tuple[bytes, HeldSegment, int]:
+        popped = queue.pop_waiting()
+        if self._oversized is queue:
+            self._oversized = None
+        return popped
+
+    # --- what becomes of it -----------------------------------------------------------------------
+
+    def settle(self, entry: Entry) -> None:
+        """It is acknowledged (below 0x80), or was sent with QoS 0; ignored if not in flight."""
+        if entry.state != IN_FLIGHT:
+            return
+        self._counts.sent += 1
+        self._land(entry)
+        self._end(entry)
+
+    def retry_later(self, entry: Entry, now: float) -> None:
+        """The fleet's broker has no room for it (0x97): it is sent again after a while.
+
+        Others overtake it. It is stored by itself, so that they need not be repeated after a kill.
+        """
+        if entry.state != IN_FLIGHT:
+            return
+        self._land(entry)
+        queue = entry.queue
+        self._again_size += entry.size + ENTRY_OVERHEAD
+        if entry.topic is not None and self._is_replaced(entry):
+            entry.state = AGAIN
+            self._discard(entry, DropReason.REPLACED)
+            return
+        if entry.part is not None and self._later_count < MOST_LATER:
+            entry.key = self._latest.put(None, _LATER + entry.record.encode(), awaited=False)
+            queue.settle(entry.part, entry.index)
+            entry.part = None
+            self._check_emptied(queue)
+        entry.state = LATER
+        self._later_count += 1
+        delay = min(LONGEST_RETRY, FIRST_RETRY * 2 ** min(entry.attempts - 1, 10))
+        heapq.heappush(self._later, (now + delay, entry.record.number, entry))
+
+    def set_aside(self, entry: Entry, reason: str, now: float) -> None:
+        """The fleet's broker will never take it: keep it for the user, and send what follows."""
+        if entry.state != IN_FLIGHT:
+            return
+        self._counts.set_aside += 1
+        self._land(entry)
+        self._aside.add(entry.record, reason, now)
+        self._end(entry)
+
+    def rewind(self) -> None:
+        """The connection has ended: what was in flight is sent again, in the same order.
+
+        What is only for a connection is forgotten.
+        """
+        self._online = False
+        flying = list(self._flying.values())
+        self._flying.clear()
+        self._flying_size = 0
+        for entry in reversed(flying):
+            queue = entry.queue
+            entry.state = AGAIN
+            self._again_size += entry.size + ENTRY_OVERHEAD
+            if entry.topic is not None and self._is_replaced(entry):
+                self._discard(entry, DropReason.REPLACED)
+            elif not _is_kept(entry):
+                self._discard(entry, DropReason.OFFLINE)
+            else:
+                queue.again.appendleft(entry)
+        for _, _, entry in self._later:
+            if entry.state == LATER and not _is_kept(entry):
+                self._discard(entry, DropReason.OFFLINE)
+        for queue in self._queues.values():
+            while queue.live:
+                data = queue.live.popleft()
+                self._live_size -= len(data) + LOADED_OVERHEAD
+                self._uncount(queue, len(data))
+                self._drop(queue, DropReason.OFFLINE)
+
+    def _is_replaced(self, entry: Entry) -> bool:
+        """Whether a newer message of its topic waits or is in flight."""
+        assert entry.topic is not None
+        queue = entry.queue
+        return queue.newest.get(entry.topic) is not entry or entry.topic in queue.latest
+
+    def _land(self, entry: Entry) -> None:
+        """It is not in flight any more."""
+        del self._flying[entry.record.number]
+        self._flying_size -= entry.size + ENTRY_OVERHEAD
+
+    def _end(self, entry: Entry) -> None:
+        """It is not waited for any more: remove it from where it is stored."""
+        entry.state = GONE
+        queue = entry.queue
+        size = entry.size
+        queue.messages -= 1
+        queue.bytes -= size
+        self._messages -= 1
+        self._bytes -= size
+        part = entry.part
+        if part is not None:
+            queue.settle(part, entry.index)
+            self._check_emptied(queue)
+        if entry.key is not None:
+            self._latest.remove(entry.key)
+            entry.key = None
+        if entry.topic is not None and queue.newest.get(entry.topic) is entry:
+            del queue.newest[entry.topic]
+
+    def _discard(self, entry: Entry, reason: DropReason) -> None:
+        """Drop an entry that is not in flight."""
+        if entry.state == LATER:
+            self._later_count -= 1
+        self._again_size -= entry.size + ENTRY_OVERHEAD
+        self._drop(entry.queue, reason)
+        self._end(entry)
+
+    def _check_emptied(self, queue: RuleQueue) -> None:
+        if not queue.stored:
+            queue.empty(self._number)
+
+    def _drop(self, queue: RuleQueue, reason: DropReason, count: int = 1) -> None:
+        if count:
+            self._counts.dropped[queue.name, reason] += count
+
+    def _count(self, queue: RuleQueue, messages: int, size: int) -> None:
+        queue.messages += messages
+        queue.bytes += size
+        self._messages += messages
+        self._bytes += size
+
+    def _uncount(self, queue: RuleQueue, size: int) -> None:
+        self._count(queue, -1, -size)
+
+    # --- status -----------------------------------------------------------------------------------
+
+    def counts(self) -> BacklogCounts:
+        """What waits now, and what has happened since the start; a copy."""
+        counts = self._counts
+        oldest: list[float] = [entry.record.stored_at for entry in self._flying.values()]
+        oldest += [entry.record.stored_at for _, _, entry in self._later if entry.state == LATER]
+        for queue in self._queues.values():
+            for at in (queue.oldest_stored(), queue.oldest_live()):
+                if at is not None:
+                    oldest.append(at)
+        lanes = [sum(queue.messages for queue in queues) for queues in self._lanes]
+        return BacklogCounts(
+            counts.offered,
+            counts.restored,
+            counts.sent,
+            counts.set_aside,
+            Counter(counts.dropped),
+            self._messages,
+            len(self._flying),
+            self._bytes,
+            (lanes[0], lanes[1], lanes[2]),
+            min(oldest, default=None),
+            len(self._aside),
+        )
+
+    def aside(self) -> list[SetAside]:
+        """The messages that were set aside and are kept, the oldest first."""
+        return self._aside.list()
+
+
+def _is_kept(entry: Entry) -> bool:
+    """Whether the message outlives the connection."""
+    return entry.topic is not None or entry.part is not None or entry.key is not None
+
+
+def _bucket(bucket: TokenBucket | None, rate: float | None, now: float) -> TokenBucket | None:
+    """The bucket of a rate: the same one if the rate has not changed."""
+    if rate is None or (bucket is not None and bucket.rate == rate):
+        return None if rate is None else bucket
+    return TokenBucket(rate, now)
+
+
+def _decode_numbers(data: bytes) -> dict[str, int]:
+    """The numbers of the rules' journals. Raises ValueError."""
+    numbers = json.loads(data)
+    if not isinstance(numbers, dict) or not all(isinstance(each, int) for each in numbers.values()):
+        raise ValueError("the table of rules is damaged")
+    return numbers

@@ -1,0 +1,87 @@
+"""Messages that the fleet's broker never took: they are kept for the user, and shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from struct import Struct, error
+from typing import Final
+
+from appliance.broker.ports import LatestRecords
+from appliance.upstream.records import Record
+
+#: The most that are kept of a link, and their bytes on disk. The oldest make room.
+MOST_ASIDE: Final = 1000
+ASIDE_SIZE: Final = 16 << 20
+
+#: Characters of a reason.
+_LONGEST_REASON: Final = 500
+
+#: When it was set aside, and the length of the reason; reason and record follow.
+_HEADER: Final = Struct(">dH")
+
+
+@dataclass(frozen=True, slots=True)
+class SetAside:
+    """A message that was set aside: when, in seconds of the journals' clock, and why.
+
+    `size` is that of its payload in bytes, `stored` of all that is stored of it.
+    """
+
+    rule: str
+    topic: str
+    size: int
+    reason: str
+    at: float
+    stored: int
+
+
+class AsideRecords:
+    """The messages of a link that were set aside: what they are is in memory, they are on disk."""
+
+    def __init__(self, records: LatestRecords) -> None:
+        self._records = records
+        self._found: dict[int, SetAside] = {}
+        self._size = 0
+        for key, row in records.load():
+            try:
+                self._note(key, _decode(row))
+            except ValueError:
+                records.remove(key)
+        self._limit()
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def add(self, record: Record, reason: str, now: float) -> None:
+        """Keep a message."""
+        text = reason[:_LONGEST_REASON].encode(errors="replace")
+        row = _HEADER.pack(now, len(text)) + text + record.encode()
+        self._note(self._records.put(None, row, awaited=False), _decode(row))
+        self._limit()
+
+    def _note(self, key: int, found: SetAside) -> None:
+        self._found[key] = found
+        self._size += found.stored
+
+    def _limit(self) -> None:
+        found = self._found
+        while len(found) > MOST_ASIDE or (self._size > ASIDE_SIZE and len(found) > 1):
+            oldest = next(iter(found))
+            self._size -= found.pop(oldest).stored
+            self._records.remove(oldest)
+
+    def list(self) -> list[SetAside]:
+        """All of them, the oldest first."""
+        return list(self._found.values())
+
+
+def _decode(row: bytes) -> SetAside:
+    """What a row contains. Raises ValueError."""
+    try:
+        at, length = _HEADER.unpack_from(row)
+    except error as short:
+        raise ValueError(str(short)) from short
+    start = _HEADER.size + length
+    record = Record.decode(row[start:])
+    reason = row[_HEADER.size : start].decode()
+    return SetAside(record.rule, record.topic, len(record.payload), reason, at, len(row))

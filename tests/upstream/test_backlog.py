@@ -1,0 +1,644 @@
+"""What waits for a link: order, lanes, the latest of a topic, what is dropped, and restarts."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+
+import pytest
+
+from appliance.broker.ports import RecordsLostError
+from appliance.mqtt.codec import NO_PROPERTIES
+from appliance.upstream.backlog import MOST_LATER, Backlog, BacklogCounts, DropReason
+from appliance.upstream.rule_queue import Entry
+from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
+from upstream.plain_backlogs import PlainBacklogs
+
+
+def rule(
+    topic: str = "#",
+    keep: KeepRule = "auto",
+    priority: Priority = "normal",
+    rate: float | None = None,
+) -> OutRule:
+    return OutRule(topic, "r/", "fleet/", keep, priority, rate)
+
+
+class Link:
+    """A backlog, and what its link does with it by hand."""
+
+    def __init__(
+        self,
+        *rules: OutRule,
+        backlogs: PlainBacklogs | None = None,
+        online: bool = True,
+        rate: float | None = None,
+        bytes_per_second: float | None = None,
+        **limits: object,
+    ) -> None:
+        self.rules = rules or (rule(),)
+        self.backlogs = backlogs or PlainBacklogs()
+        self.limits = BacklogLimits(**limits)  # type: ignore[arg-type]
+        self.rates = {"rate": rate, "bytes_per_second": bytes_per_second}
+        self.woken = 0
+        self.backlog = self.start()
+        if online:
+            self.backlog.connected()
+
+    def start(self) -> Backlog:
+        now = self.backlogs.time
+        return Backlog("f", self.backlogs, self.rules, self.limits, now, self.wake, **self.rates)
+
+    def wake(self) -> None:
+        self.woken += 1
+
+    def restart(self) -> None:
+        """The process is killed and starts again."""
+        self.backlogs = self.backlogs.restarted()
+        self.backlogs.time += 1
+        self.backlog = self.start()
+        self.backlog.connected()
+
+    def offer(
+        self,
+        payload: bytes | str = b"",
+        topic: str = "t",
+        qos: int = 1,
+        *,
+        of: int = 0,
+        retain: bool = False,
+        expires_in: float | None = None,
+    ) -> str | None:
+        data = payload.encode() if isinstance(payload, str) else payload
+        now = self.backlogs.time
+        expires_at = None if expires_in is None else now + expires_in
+        return self.backlog.offer(
+            self.rules[of], topic, data, qos, retain, NO_PROPERTIES, expires_at, now
+        )
+
+    def next(self) -> Entry | None:
+        """The next entry; what has to be read is read."""
+        while True:
+            entry = self.backlog.next(self.backlogs.time)
+            if entry is not None or not self.backlogs.rounds:
+                return entry
+            self.backlogs.turn()
+
+    def take(self, most: int = 1 << 30) -> list[Entry]:
+        found: list[Entry] = []
+        while len(found) < most and (entry := self.next()) is not None:
+            found.append(entry)
+        return found
+
+    def drain(self) -> list[str]:
+        """Send and settle all; returns the payloads."""
+        sent: list[str] = []
+        while found := self.take(100):
+            for entry in found:
+                sent.append(entry.record.payload.decode())
+                self.backlog.settle(entry)
+        return sent
+
+    def counts(self) -> BacklogCounts:
+        counts = self.backlog.counts()
+        dropped = sum(counts.dropped.values())
+        assert counts.offered + counts.restored == (
+            counts.sent + dropped + counts.set_aside + counts.waiting
+        )
+        assert (counts.waiting == 0) == (counts.bytes == 0) == (counts.oldest_at is None)
+        return counts
+
+    def dropped(self) -> dict[str, int]:
+        """By the value of the reason."""
+        found: Counter[str] = Counter()
+        for (_, reason), number in self.counts().dropped.items():
+            found[reason.value] += number
+        return dict(found)
+
+
+def payloads(entries: list[Entry]) -> list[str]:
+    return [entry.record.payload.decode() for entry in entries]
+
+
+def test_a_message_is_handed_out_as_it_was_offered() -> None:
+    link = Link(rule("events/#"))
+    link.backlog.offer(link.rules[0], "fleet/a", b"data", 2, True, b"\x02\x01\x01", 1010.5, 1000.0)
+    entry = link.next()
+    assert entry is not None
+    record = entry.record
+    assert (record.rule, record.topic, record.payload) == ("r/events/#", "fleet/a", b"data")
+    assert (record.qos, record.retain, record.properties_wire) == (2, True, b"\x02\x01\x01")
+    assert (entry.qos, entry.expiry, entry.published_at, entry.attempts) == (1, 11, None, 1)
+    assert link.counts().in_flight == 1
+    link.backlog.settle(entry)
+    link.backlog.settle(entry)
+    assert link.next() is None
+    assert link.counts().sent == 1
+
+
+def test_all_are_sent_in_order_however_they_are_settled() -> None:
+    backlogs = PlainBacklogs(segment_size=300)
+    link = Link(backlogs=backlogs)
+    for number in range(100):
+        link.offer(str(number))
+        if number % 7 == 0:
+            backlogs.commit()
+    entries = link.take()
+    assert payloads(entries) == [str(number) for number in range(100)]
+    random.Random(1).shuffle(entries)
+    for entry in entries:
+        link.backlog.settle(entry)
+    backlogs.commit()
+    assert not backlogs.journals[0].list and link.counts().waiting == 0
+
+
+def test_rewind_repeats_what_was_in_flight_in_order() -> None:
+    link = Link()
+    for number in range(10):
+        link.offer(str(number))
+    entries = link.take(6)
+    for entry in (entries[1], entries[4]):
+        link.backlog.settle(entry)
+    link.backlog.rewind()
+    link.backlog.settle(entries[0])  # an acknowledgement on a connection that ended
+    assert link.counts().in_flight == 0
+    link.backlog.connected()
+    again = link.take(2)
+    assert payloads(again) == ["0", "2"] and [each.attempts for each in again] == [2, 2]
+    link.backlog.rewind()
+    assert link.drain() == ["0", "2", "3", "5", "6", "7", "8", "9"]
+    assert link.counts().sent == 10
+
+
+def test_a_number_is_the_same_each_time_and_none_is_used_twice() -> None:
+    link = Link()
+    numbers: dict[str, set[int]] = {}
+    for run in range(5):
+        for each in range(10):
+            link.offer(f"{run} {each}")
+        link.backlogs.commit()
+        for entry in link.take():
+            numbers.setdefault(entry.record.payload.decode(), set()).add(entry.record.number)
+        link.restart()
+    assert all(len(found) == 1 for found in numbers.values())
+    assert len(set.union(*numbers.values())) == 50
+
+
+def test_after_a_kill_all_that_was_committed_and_not_settled_is_sent() -> None:
+    link = Link(backlogs=PlainBacklogs(segment_size=400))
+    for number in range(20):
+        link.offer(str(number))
+        if number == 9:
+            link.backlogs.commit()
+    for entry in link.take(14):
+        link.backlog.settle(entry)
+    link.backlogs.commit()
+    link.offer("lost: nobody was told that it is stored")
+    link.restart()
+    assert link.counts().restored == 6
+    link.offer("20")
+    assert link.drain() == [str(number) for number in range(14, 21)]
+
+
+def test_lanes() -> None:
+    """The highest first, but each of the others gets at least one in 16."""
+    link = Link(rule("h", priority="high"), rule("n"), rule("l", priority="low"))
+    for number in range(64):
+        for of in range(3):
+            link.offer("hnl"[of] + str(number), of=of)
+    order = [each[0] for each in link.drain()]
+    for start in range(64 - 16):
+        window = order[start : start + 16]
+        assert window.count("n") >= 1 and window.count("l") >= 1, window
+        assert window.count("h") >= 13, window
+    assert order[:5] == ["h"] * 5
+    assert Counter(order) == {"h": 64, "n": 64, "l": 64}
+
+
+def test_rules_of_a_lane_are_sent_in_the_order_of_publishing() -> None:
+    link = Link(rule("a"), rule("b"), rule("c"))
+    expected = []
+    choose = random.Random(3)
+    for number in range(50):
+        link.offer(str(number), of=choose.randrange(3))
+        expected.append(str(number))
+    assert link.drain() == expected
+
+
+def test_the_latest_of_a_topic() -> None:
+    link = Link(online=False)
+    for number in range(50):
+        link.offer(f"a{number}", "a", qos=0)
+        link.offer(f"b{number}", "b", qos=1, retain=True)
+    link.offer("", "b", retain=True)
+    assert link.counts().waiting == 2
+    assert link.dropped() == {"replaced": 99}
+    found = {entry.record.topic: entry for entry in link.take()}
+    assert found["a"].record.payload == b"a49" and found["a"].qos == 0
+    assert found["b"].record.payload == b"" and found["b"].record.retain and found["b"].qos == 1
+
+
+def test_a_newer_one_is_sent_after_the_one_in_flight() -> None:
+    link = Link(rule(keep="latest"))
+    link.offer("1")
+    (first,) = link.take()
+    link.offer("2")
+    link.offer("3")
+    (third,) = link.take()
+    assert third.record.payload == b"3"
+    link.backlog.settle(third)
+    link.backlog.settle(first)
+    link.backlogs.commit()
+    assert len(link.backlogs.latest_records.rows) == 0
+    assert link.counts().sent == 2
+
+
+def test_an_older_one_is_not_sent_again_after_a_newer_one() -> None:
+    link = Link(rule(keep="latest"))
+    link.offer("1")
+    link.take()
+    link.offer("2")
+    link.take()
+    link.backlog.rewind()
+    assert link.dropped() == {"replaced": 1}
+    link.offer("3")  # while "2" waits to be sent again
+    assert link.drain() == ["3"]
+    link.offer("4")
+    link.take()
+    link.offer("5")
+    link.backlog.rewind()
+    link.backlogs.commit()
+    link.restart()
+    assert link.drain() == ["5"]
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+def test_the_latest_one_survives_a_kill(qos: int) -> None:
+    """Retained or with QoS 1. One of QoS 0 that replaces it is stored as well."""
+    link = Link(rule(keep="latest"))
+    link.offer("1", qos=qos, retain=True)
+    link.take()
+    link.offer("2", qos=0)
+    link.offer("forgotten", "u", qos=0)
+    link.backlogs.commit()
+    link.restart()
+    assert link.drain() == ["2"]
+    link.backlogs.commit()
+    link.restart()
+    assert link.drain() == []
+
+
+def test_the_latest_does_not_overtake_what_came_before_of_its_topic() -> None:
+    """With `auto` a topic may have both: retained messages, and others."""
+    link = Link(online=False)
+    link.offer("1", "t")
+    link.offer("x", "u", retain=True)
+    link.offer("2", "t", retain=True)
+    link.offer("3", "t", retain=True)
+    link.offer("y", "u", retain=True)
+    link.offer("4", "t")
+    link.offer("z", "u")
+    sent = link.drain()
+    assert [each for each in sent if each.isdigit()] == ["1", "2", "3", "4"]
+    assert [each for each in sent if not each.isdigit()] == ["y", "z"]
+    link.offer("5", "t", retain=True)
+    link.offer("6", "t", retain=True)
+    assert link.drain() == ["6"]
+
+
+def test_live_messages_do_not_wait_for_a_backlog() -> None:
+    link = Link()
+    for number in range(100):
+        link.offer(str(number))
+    link.offer("now", qos=0)
+    assert link.drain().index("now") <= 1
+
+
+def test_none_forgets_while_offline() -> None:
+    link = Link(rule(keep="none"), online=False)
+    link.offer("1")
+    link.backlog.connected()
+    for payload in "2345":
+        link.offer(payload)
+    first, second = link.take(2)
+    link.backlog.settle(first)
+    link.backlog.retry_later(second, link.backlogs.time)
+    link.take(1)
+    link.backlog.rewind()
+    assert link.counts().waiting == 0
+    assert link.dropped() == {"offline": 4}
+    assert (first.qos, link.counts().sent) == (1, 1)
+
+
+def test_expired_and_aged_messages_are_not_sent() -> None:
+    link = Link(rule(), rule("l", keep="latest"), age=60.0)
+    link.offer("expires", expires_in=10.0)
+    link.offer("ages", "a")
+    link.offer("expires", of=1, expires_in=10.0)
+    (entry,) = link.take(1)
+    assert (entry.expiry, entry.published_at) == (10, None)
+    link.backlog.rewind()
+    link.backlogs.time += 5.5
+    (entry,) = link.take(1)
+    assert (entry.expiry, entry.published_at) == (5, 1000.0)
+    link.backlog.rewind()
+    link.backlogs.time += 5
+    assert payloads(link.take(1)) == ["ages"]
+    assert link.dropped() == {"expired": 1}
+    link.backlog.rewind()
+    link.backlog.tick(link.backlogs.time)
+    assert link.dropped() == {"expired": 2}
+    link.backlogs.time += 60
+    assert link.next() is None
+    assert link.dropped() == {"expired": 2, "age": 1}
+
+
+def test_what_is_on_disk_ages() -> None:
+    backlogs = PlainBacklogs(segment_size=1000)
+    link = Link(backlogs=backlogs, age=100.0)
+    for number in range(100):
+        link.offer(str(number))
+        backlogs.commit()
+        backlogs.time += 1
+    link.restart()
+    backlogs = link.backlogs
+    backlogs.time += 49
+    link.backlog.tick(backlogs.time)
+    assert link.dropped() == {"age": 51}
+    assert link.drain() == [str(number) for number in range(51, 100)]
+    assert link.counts().oldest_at is None
+
+
+def test_full_the_oldest_of_the_lowest_lane_goes(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link(rule("h", priority="high"), rule("n"), rule("l", priority="low"), size=10_000)
+    for of in (0, 2):
+        for number in range(30):
+            link.offer(f"{of} {number:100}", of=of)
+    for number in range(20):
+        link.offer(f"1 {number:100}", of=1)
+    assert link.counts().bytes <= 10_000
+    sent = link.drain()
+    kept = [sum(each.startswith(f"{of} ") for each in sent) for of in range(3)]
+    assert kept[0] == 30 and kept[1] == 20 and 0 < kept[2] < 30
+    low = [int(each[2:]) for each in sent if each.startswith("2 ")]
+    assert low == list(range(30 - kept[2], 30))
+    assert link.counts().dropped == {("r/l", DropReason.FULL): 30 - kept[2]}
+    link.backlog.tick(0.0)
+    told = [each.getMessage() for each in caplog.records]
+    assert len(told) == 2 and "is full" in told[0]
+    assert f"room again; {30 - kept[2]} messages" in told[1]
+
+
+def test_full_of_what_is_more_urgent_the_message_itself_goes() -> None:
+    link = Link(rule("h", priority="high"), rule("l", priority="low"), size=5_000)
+    while not link.dropped():
+        link.offer("x" * 100, of=0)
+    waiting = link.counts().waiting
+    assert link.offer("x" * 100, of=1) is None
+    assert link.counts().dropped["r/l", DropReason.FULL] == 1
+    assert link.offer("x" * 6_000, of=0) is None
+    assert link.counts().waiting == waiting
+    assert link.counts().dropped["r/h", DropReason.FULL] == 2
+
+
+def test_full_and_refuse(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link(rule(), rule("l", keep="latest"), size=5_000, when_full="refuse", age=60.0)
+    assert link.offer("y" * 100, of=1) is None
+    accepted = 0
+    while (problem := link.offer(f"{accepted:100}")) is None:
+        accepted += 1
+    assert problem == "the backlog of f is full"
+    assert link.offer("z" * 100, of=1) is None  # in place of the one that waits
+    assert link.dropped() == {"refused": 1, "replaced": 1}
+    assert len(caplog.records) == 1
+    link.backlogs.time += 61
+    assert link.offer("new") is None
+    assert link.drain() == ["new"]
+
+
+def test_what_cannot_be_stored_is_refused() -> None:
+    link = Link()
+    link.backlogs.failing = True
+    assert link.offer("1") == "the backlog of f cannot be stored"
+    assert link.offer("2", retain=True) == "the backlog of f cannot be stored"
+    assert link.offer("3", qos=0) is None
+    assert link.drain() == ["3"]
+    assert link.dropped() == {"store": 2}
+
+
+@pytest.mark.parametrize("commits", [2, 7, 1000])
+def test_an_outage_keeps_exactly_the_newest(commits: int) -> None:
+    backlogs = PlainBacklogs(segment_size=4096)
+    link = Link(rule(), rule("low", priority="low"), backlogs=backlogs, size=30_000, online=False)
+    for number in range(1_000):
+        link.offer(f"{number:200}")
+        if number % commits == 0:
+            backlogs.commit()
+            for journal in backlogs.journals.values():
+                journal.merge()
+        assert link.counts().bytes <= 30_000
+    assert backlogs.reads == 0  # nothing is read to be dropped
+    waiting = link.counts().waiting
+    assert link.counts().bytes >= 30_000 - 4096 - 300
+    assert link.dropped() == {"full": 1_000 - waiting}
+    assert [int(each) for each in link.drain()] == list(range(1_000 - waiting, 1_000))
+
+
+def test_a_retry_does_not_block_what_follows() -> None:
+    link = Link()
+    for number in range(5):
+        link.offer(str(number))
+    first, second = link.take(2)
+    link.backlog.retry_later(first, 1000.0)
+    assert link.drain() == ["2", "3", "4"]
+    link.backlog.settle(second)
+    assert link.backlog.due(1000.0) == 1001.0
+    link.backlogs.time = 1001.0
+    (again,) = link.take()
+    assert again is first and again.attempts == 2
+    link.backlog.retry_later(again, 1001.0)
+    assert link.backlog.due(1001.0) == 1003.0
+    link.backlogs.commit()
+    link.restart()  # nothing but this one is repeated
+    assert link.drain() == ["0"]
+    link.backlogs.commit()
+    link.restart()
+    assert link.drain() == []
+
+
+def test_many_retries_hold_up_the_rest() -> None:
+    """The fleet's broker takes nothing: it is not asked for each message."""
+    link = Link()
+    for number in range(10 * MOST_LATER):
+        link.offer(str(number))
+    for _ in range(2 * MOST_LATER):
+        entry = link.next()
+        if entry is None:
+            break
+        link.backlog.retry_later(entry, link.backlogs.time)
+    assert link.counts().waiting == 10 * MOST_LATER
+    assert link.next() is None
+    due = link.backlog.due(link.backlogs.time)
+    assert due == 1001.0
+    while link.counts().waiting:
+        link.drain()
+        link.backlogs.time = link.backlog.due(link.backlogs.time) or link.backlogs.time + 1
+
+
+def test_a_latest_one_is_not_tried_again_after_a_newer_one() -> None:
+    link = Link(rule(keep="latest"))
+    link.offer("1")
+    (first,) = link.take()
+    link.backlog.retry_later(first, 1000.0)
+    link.offer("2")
+    assert link.drain() == ["2"]
+    link.offer("3")
+    (third,) = link.take()
+    link.offer("4")
+    (fourth,) = link.take()
+    link.backlog.retry_later(third, 1000.0)
+    link.backlog.settle(fourth)
+    link.backlogs.time += 100
+    assert link.drain() == []
+    assert link.dropped() == {"replaced": 2}
+
+
+def test_set_aside() -> None:
+    link = Link()
+    for number in range(1005):
+        link.offer(str(number))
+    for entry in link.take():
+        link.backlog.set_aside(entry, "Not authorized (0x87)", link.backlogs.time)
+    assert link.counts().set_aside == 1005 and link.counts().aside == 1000
+    assert link.counts().waiting == 0
+    link.backlogs.commit()
+    link.restart()
+    found = link.backlog.aside()
+    assert len(found) == len(link.backlogs.aside_records.rows) == 1000
+    assert (found[0].topic, found[0].reason, found[0].size) == ("t", "Not authorized (0x87)", 1)
+    assert (found[0].rule, found[0].at) == ("r/#", 1000.0)
+    assert link.drain() == []
+
+
+def test_rates() -> None:
+    link = Link(rule("slow", rate=10.0), rule("fast"), rate=100.0)
+    for number in range(300):
+        link.offer(f"s{number}", of=0)
+        link.offer(f"f{number}", of=1)
+    sent: list[tuple[float, str]] = []
+    now = link.backlogs.time
+    while link.counts().waiting and now < 1100:
+        for payload in link.drain():
+            sent.append((now, payload))
+        due = link.backlog.due(now)
+        if due is None:
+            break
+        assert due > now
+        link.backlogs.time = now = due
+    assert len(sent) == 600
+    fast = [at for at, payload in sent if payload[0] == "f"]
+    slow = [at for at, payload in sent if payload[0] == "s"]
+    assert fast[-1] - fast[0] == pytest.approx(300 / 90, rel=0.05)
+    assert slow[-1] - slow[0] == pytest.approx(30, rel=0.05)
+
+
+def test_bytes_per_second() -> None:
+    link = Link(bytes_per_second=10_000)
+    for _ in range(100):
+        link.offer("x" * 950)
+    size = link.counts().bytes
+    while link.counts().waiting:
+        link.drain()
+        link.backlogs.time = link.backlog.due(link.backlogs.time) or link.backlogs.time
+    assert link.backlogs.time - 1000.0 == pytest.approx(size / 10_000, rel=0.05)
+
+
+def test_other_rules_are_followed() -> None:
+    """What waits for a rule that is no more is sent; a rule may get another lane."""
+    link = Link(rule("old"), rule("kept", priority="low"))
+    link.offer("1", of=0)
+    link.offer("2", of=1)
+    link.rules = (rule("kept", priority="high"), rule("new"))
+    link.backlog.replace_rules(link.rules, BacklogLimits(size=500), 1000.0)
+    link.offer("3", of=0)
+    link.offer("4", of=1)
+    assert link.drain() == ["2", "3", "1", "4"]
+    link.backlog.tick(1000.0)
+    link.offer("5", of=1)
+    link.offer("x" * 500, of=1)
+    assert link.dropped() == {"full": 1}
+    link.backlogs.commit()
+    link.rules = (rule("none of these"),)
+    link.restart()
+    assert link.drain() == ["5"]
+
+
+def test_journals_of_rules_that_are_no_more_are_reused() -> None:
+    link = Link(rule("0"))
+    for number in range(1, 20):
+        link.offer("x")
+        assert link.drain() == ["x"]
+        link.rules = (rule(str(number)),)
+        link.backlog.replace_rules(link.rules, link.limits, 1000.0)
+    assert len(link.backlogs.journals) == 1
+
+
+def test_a_read_that_fails_is_repeated() -> None:
+    link = Link()
+    link.offer("1")
+    link.backlogs.commit()
+    link.restart()
+    link.backlogs.failures.append(OSError("disk I/O error"))
+    assert link.next() is None
+    due = link.backlog.due(link.backlogs.time)
+    assert due is not None and due > link.backlogs.time
+    link.backlogs.time = due
+    assert link.drain() == ["1"]
+
+
+def test_damaged_records_are_counted() -> None:
+    backlogs = PlainBacklogs(segment_size=300)
+    link = Link(backlogs=backlogs)
+    for number in range(12):
+        link.offer(str(number))
+    backlogs.commit()
+    link.restart()
+    first = link.backlogs.journals[0].list[0]
+    journal = link.backlogs.journals[0]
+    records = journal.records[journal.list[1].key]
+    records[0] = b"\xff" + records[0][1:]  # of a newer version, say
+    link.backlogs.failures.append(RecordsLostError("damaged"))
+    sent = link.drain()
+    lost = first.count + 1
+    assert link.dropped() == {"unreadable": lost}
+    assert len(sent) == 12 - lost
+
+
+def test_wakes_once_when_there_is_something_again() -> None:
+    link = Link()
+    assert link.woken == 0
+    link.offer("1")
+    link.offer("2")
+    assert link.woken == 1
+    link.drain()
+    link.offer("3")
+    assert link.woken == 2
+    link.backlogs.commit()
+    link.restart()
+    assert link.backlog.next(link.backlogs.time) is None
+    link.backlogs.turn()
+    assert link.woken == 3
+    assert link.backlog.next(link.backlogs.time) is not None
+
+
+def test_rows_of_another_version_are_removed() -> None:
+    link = Link()
+    link.backlogs.latest_records.put(None, b"")
+    link.backlogs.latest_records.put(None, b"Lnonsense")
+    link.backlogs.latest_records.put(None, b"N[1]")
+    link.backlogs.aside_records.put(None, b"nonsense")
+    link.backlogs.commit()
+    link.restart()
+    assert not link.backlogs.latest_records.rows and not link.backlogs.aside_records.rows
+    link.offer("1")
+    assert link.drain() == ["1"]

@@ -1,0 +1,431 @@
+"""Random operations on a backlog, against a naive one: a list a rule."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, field
+
+import pytest
+
+from appliance.upstream import backlog as module
+from appliance.upstream.backlog import DropReason
+from appliance.upstream.rule_queue import GONE, Entry
+from appliance.upstream.rules import OutRule
+from upstream.plain_backlogs import PlainBacklogs
+from upstream.test_backlog import Link, rule
+
+MIXED = (
+    rule("a"),
+    rule("b", priority="high"),
+    rule("c", keep="latest"),
+    rule("d", keep="none", priority="high"),
+    rule("e", keep="all", priority="low", rate=50.0),
+    rule("f", priority="low"),
+)
+
+#: Each has one kind, so that it is known which of its messages is the oldest.
+PLAIN = (
+    rule("a", keep="all"),
+    rule("b", keep="all", priority="high"),
+    rule("c", keep="latest"),
+    rule("d", keep="all", priority="low"),
+    rule("e", keep="latest", priority="low"),
+    rule("f", keep="all", priority="low"),
+)
+
+
+@dataclass(eq=False)
+class Sent:
+    """A message, as the twin knows it."""
+
+    name: str
+    of: int
+    topic: str
+    kind: str
+    qos: int
+    retain: bool
+    size: int = 0
+    expires_at: float | None = None
+    is_stored: bool = False
+    retried: bool = False
+
+
+@dataclass
+class Waiting:
+    """What the twin knows of a rule."""
+
+    again: list[Sent] = field(default_factory=list)
+    all: list[Sent] = field(default_factory=list)
+    latest: dict[str, Sent] = field(default_factory=dict)
+    live: list[Sent] = field(default_factory=list)
+
+    def first(self) -> list[Sent]:
+        """Those that may be next."""
+        found = (self.again or self.all)[:1] + self.live[:1]
+        return found + list(self.latest.values())[:1]
+
+    def every(self) -> list[Sent]:
+        return self.again + self.all + self.live + list(self.latest.values())
+
+
+class Twin:
+    """A backlog and its naive twin, which does the same and looks at each step."""
+
+    def __init__(self, seed: int, rules: tuple[OutRule, ...], **limits: object) -> None:
+        self.choose = random.Random(seed)
+        self.rules = rules
+        self.link = Link(*rules, backlogs=PlainBacklogs(self.choose.choice([200, 1000])), **limits)
+        self.waiting = [Waiting() for _ in rules]
+        self.flying: dict[Entry, Sent] = {}
+        self.later: dict[Entry, Sent] = {}
+        self.online = True
+        self.serial = 0
+        self.seen_drops: dict[tuple[str, DropReason], int] = {}
+        #: By rule and topic: the newest message handed out that counts as the latest one.
+        self.newest: dict[tuple[int, str], int] = {}
+        #: What a kill may bring back: since the last commit, settled or dropped.
+        self.revived: set[str] = set()
+        #: What a kill does not lose.
+        self.committed: set[str] = set()
+
+    @property
+    def now(self) -> float:
+        return self.link.backlogs.time
+
+    # --- operations -----------------------------------------------------------------------------
+
+    def offer(self) -> None:
+        choose = self.choose
+        of = choose.randrange(len(self.rules))
+        qos = choose.randrange(3)
+        retain = choose.random() < 0.2
+        self.serial += 1
+        name = f"{self.serial}" + " " * choose.choice([0, 0, 10, 100])
+        topic = f"{self.rules[of].topic}/{choose.randrange(4)}"
+        keep = self.rules[of].keep
+        kind = keep if keep != "auto" else "latest" if retain or not qos else "all"
+        expires = choose.choice([None, None, None, 0.3, 5.0])
+        waiting = self.waiting[of]
+        sent = Sent(name, of, topic, kind, qos, retain)
+        sent.expires_at = None if expires is None else self.now + expires
+        if kind == "none" and not self.online:
+            assert self.link.offer(name, topic, qos, of=of, retain=retain) is None
+            self.expect(of, DropReason.OFFLINE)
+            return
+        self.link.offer(name, topic, qos, of=of, retain=retain, expires_in=expires)
+        self.take_drops(but=sent)
+        if sent.size < 0:
+            return
+        if kind == "latest" and qos and self.may_be_stored(of, topic):
+            kind = sent.kind = "all"
+        if kind == "all":
+            before = waiting.latest.get(topic)
+            if before is not None and before.qos:
+                del waiting.latest[topic]
+                before.kind = "all"
+                waiting.all.append(before)
+            waiting.all.append(sent)
+            sent.is_stored = True
+        elif kind == "latest":
+            before = waiting.latest.get(topic)
+            unsettled = [each for each in self.unsettled(of) if each.kind == "latest"]
+            unsettled = [each for each in unsettled if each.topic == topic]
+            sent.is_stored = qos > 0 or retain
+            if before is not None:
+                self.expect(of, DropReason.REPLACED)
+                sent.is_stored |= before.is_stored
+            elif unsettled:
+                newest = unsettled[-1]
+                sent.is_stored |= newest.is_stored
+                newest.is_stored = False
+                if newest in waiting.again:
+                    waiting.again.remove(newest)
+                    self.expect(of, DropReason.REPLACED)
+                for entry in [each for each, value in self.later.items() if value is newest]:
+                    del self.later[entry]
+                    self.expect(of, DropReason.REPLACED)
+            waiting.latest[topic] = sent
+        else:
+            waiting.live.append(sent)
+
+    def unsettled(self, of: int) -> list[Sent]:
+        """What was handed out of a rule, in the order of its publication."""
+        found = [*self.flying.values(), *self.later.values(), *self.waiting[of].again]
+        return sorted((each for each in found if each.of == of), key=lambda each: int(each.name))
+
+    def may_be_stored(self, of: int, topic: str) -> bool:
+        """Whether older messages of the topic are in the journal; the backlog knows about that."""
+        return self.link.backlog._queues[self.rules[of].local_filter].may_store(topic) or any(
+            each.topic == topic and each.kind == "all" and not each.retried
+            for each in (*self.waiting[of].all, *self.unsettled(of))
+        )
+
+    def next(self) -> None:
+        entry = self.link.next()
+        if entry is None:
+            self.take_drops()
+            ready = [each for each in self.waiting if each.first()]
+            limited = {"e"} | ({each.topic for each in self.rules} if self.is_held_up() else set())
+            assert all(
+                self.rules[self.waiting.index(each)].topic in limited or self.is_outdated(each)
+                for each in ready
+            ), ready
+            return
+        name = entry.record.payload.decode()
+        sent = next((each for each in self.later.values() if each.name == name), None)
+        if sent is not None:
+            del self.later[entry]
+            self.take_drops()
+        else:
+            of = [each.local_filter for each in self.rules].index(entry.record.rule)
+            waiting = self.waiting[of]
+            self.take_drops()
+            heads = {each.name: each for each in waiting.first()}
+            assert name in heads, (name, heads)
+            sent = heads[name]
+            for queue in (waiting.again, waiting.all, waiting.live):
+                if queue[:1] == [sent]:
+                    del queue[0]
+            if waiting.latest.get(sent.topic) is sent:
+                del waiting.latest[sent.topic]
+        record = entry.record
+        assert (record.topic, record.qos, record.retain) == (sent.topic, sent.qos, sent.retain)
+        assert record.expires_at == sent.expires_at
+        assert sent.expires_at is None or sent.expires_at > self.now
+        self.flying[entry] = sent
+        if sent.kind == "latest":
+            key = sent.of, sent.topic
+            self.newest[key] = max(self.newest.get(key, 0), int(sent.name))
+
+    def is_held_up(self) -> bool:
+        return len(self.later) >= module.MOST_LATER or bool(self.flying)
+
+    def is_outdated(self, waiting: Waiting) -> bool:
+        return all(each.expires_at is not None for each in waiting.first())
+
+    def settle(self) -> None:
+        if self.flying:
+            entry = self.choose.choice(list(self.flying))
+            sent = self.flying.pop(entry)
+            self.revived.add(sent.name)
+            self.link.backlog.settle(entry)
+
+    def retry(self) -> None:
+        if self.flying and len(self.later) < 10:
+            entry = self.choose.choice(list(self.flying))
+            sent = self.flying.pop(entry)
+            self.link.backlog.retry_later(entry, self.now)
+            if sent.kind == "latest" and self.is_replaced(sent):
+                self.expect(sent.of, DropReason.REPLACED)
+            else:
+                sent.retried = True
+                self.later[entry] = sent
+
+    def is_replaced(self, sent: Sent) -> bool:
+        newest = self.newest.get((sent.of, sent.topic), 0)
+        return int(sent.name) < newest or sent.topic in self.waiting[sent.of].latest
+
+    def aside(self) -> None:
+        if self.flying:
+            entry = self.choose.choice(list(self.flying))
+            sent = self.flying.pop(entry)
+            self.revived.add(sent.name)
+            self.link.backlog.set_aside(entry, "poison", self.now)
+
+    def rewind(self) -> None:
+        self.online = False
+        before: dict[int, list[Sent]] = {}
+        flying = list(self.flying.values())
+        for sent in flying:
+            if sent.kind == "none":
+                self.expect(sent.of, DropReason.OFFLINE)
+            elif sent.kind == "latest" and self.is_replaced(sent):
+                self.expect(sent.of, DropReason.REPLACED)
+            else:
+                before.setdefault(sent.of, []).append(sent)
+        self.flying.clear()
+        for entry, sent in list(self.later.items()):
+            if sent.kind == "none":
+                del self.later[entry]
+                self.expect(sent.of, DropReason.OFFLINE)
+        for of, found in before.items():
+            self.waiting[of].again[:0] = found
+        for of, waiting in enumerate(self.waiting):
+            for _ in waiting.live:
+                self.expect(of, DropReason.OFFLINE)
+            waiting.live.clear()
+        self.link.backlog.rewind()
+
+    def connect(self) -> None:
+        self.online = True
+        self.link.backlog.connected()
+
+    def commit(self) -> None:
+        self.link.backlogs.commit()
+        self.revived.clear()
+        self.committed = {each.name for each in self.every() if each.is_stored}
+
+    def merge(self) -> None:
+        for journal in self.link.backlogs.journals.values():
+            journal.merge()
+
+    def wait(self) -> None:
+        self.link.backlogs.time += self.choose.choice([0.01, 0.1, 1.0])
+        self.link.backlog.tick(self.now)
+        self.take_drops()
+
+    # --- drops ----------------------------------------------------------------------------------
+
+    def expect(self, of: int, reason: DropReason) -> None:
+        """One more is dropped."""
+        key = self.rules[of].local_filter, reason
+        self.seen_drops[key] = self.seen_drops.get(key, 0) + 1
+
+    def take_drops(self, but: Sent | None = None) -> None:
+        """Follow what the backlog has dropped by itself: the oldest, or what has expired."""
+        dropped = self.link.backlog.counts().dropped
+        full_rules = [of for of in range(len(self.rules)) if self.unseen(of, DropReason.FULL)]
+        for of, each in enumerate(self.rules):
+            outdated = self.unseen(of, DropReason.EXPIRED) + self.unseen(of, DropReason.AGE)
+            full = self.unseen(of, DropReason.FULL)
+            while outdated or full:
+                queue = self.waiting[of]
+                if outdated and (found := self.outdated(of)) is not None:
+                    self.remove(of, found)
+                    outdated -= 1
+                    continue
+                assert full, (queue, dropped)
+                full -= 1
+                if queue.first():
+                    self.remove(of, queue.first()[0])
+                else:
+                    assert but is not None and but.of == of
+                    but.size = -1
+            for reason in (DropReason.EXPIRED, DropReason.AGE, DropReason.FULL):
+                key = each.local_filter, reason
+                self.seen_drops[key] = dropped[key]
+        for of in full_rules:
+            self.check_lower(of)
+
+    def unseen(self, of: int, reason: DropReason) -> int:
+        key = self.rules[of].local_filter, reason
+        return self.link.backlog.counts().dropped[key] - self.seen_drops.get(key, 0)
+
+    def check_lower(self, of: int) -> None:
+        """Nothing less urgent was left when this one was dropped."""
+        lane = self.rules[of].lane
+        for other, each in zip(self.rules, self.waiting, strict=True):
+            assert other.lane <= lane or not each.every(), (other, each)
+
+    def outdated(self, of: int) -> Sent | None:
+        """One that has expired: a latest one that is not there any more, or one at a front."""
+        queue = self.waiting[of]
+        there = self.link.backlog._queues[self.rules[of].local_filter].latest
+        found = [each for topic, each in queue.latest.items() if topic not in there]
+        found += [each for entry, each in self.later.items() if entry.state == GONE]
+        found += (queue.again or queue.all)[:1] + queue.live[:1]
+        for each in found:
+            if each.of == of and each.expires_at is not None and each.expires_at <= self.now:
+                return each
+        return None
+
+    def remove(self, of: int, sent: Sent) -> None:
+        queue = self.waiting[of]
+        self.revived.add(sent.name)
+        for waiting in (queue.again, queue.all, queue.live):
+            if sent in waiting:
+                waiting.remove(sent)
+        if queue.latest.get(sent.topic) is sent:
+            del queue.latest[sent.topic]
+        for entry in [each for each, value in self.later.items() if value is sent]:
+            del self.later[entry]
+
+    def every(self) -> list[Sent]:
+        return [
+            *self.flying.values(),
+            *self.later.values(),
+            *(sent for waiting in self.waiting for sent in waiting.every()),
+        ]
+
+    def check(self) -> None:
+        counts = self.link.counts()
+        assert counts.waiting == len(self.every())
+        assert counts.in_flight == len(self.flying)
+        seen = {key: number for key, number in self.seen_drops.items() if number}
+        assert dict(counts.dropped) == seen
+        assert counts.bytes <= self.link.limits.size
+
+    # --- the ends -------------------------------------------------------------------------------
+
+    def drain(self) -> None:
+        """All that waits is sent, in the order of each rule."""
+        self.connect()
+        while self.link.counts().waiting:
+            self.next()
+            while self.flying:
+                self.settle()
+            self.link.backlogs.time += 0.05
+            self.check()
+        self.commit()
+        assert not any(journal.list for journal in self.link.backlogs.journals.values())
+        rows = self.link.backlogs.latest_records.rows.values()
+        assert [row for row in rows if row[:1] != b"N"] == []
+
+    def kill(self) -> None:
+        """What was committed is there, in order; nothing else but what a commit did not take."""
+        alive = {each.name: each for each in self.every() if each.is_stored}
+        topics: dict[tuple[int, str], list[str]] = {}
+        for each in alive.values():
+            topics.setdefault((each.of, each.topic), []).append(each.name)
+        self.link.restart()
+        found: list[str] = []
+        while self.link.counts().waiting:
+            found += self.link.drain()
+            self.link.backlogs.time += 0.05
+        assert len(set(found)) == len(found)
+        missing = self.committed - set(found) - self.revived
+        for name in missing:
+            each = alive.get(name)
+            expired = each is None or (each.expires_at is not None)
+            assert expired, (name, each)
+
+
+OPERATIONS = ["offer"] * 12 + ["next"] * 10 + ["settle"] * 8 + ["commit", "merge", "rewind"]
+OPERATIONS += ["connect", "connect", "wait", "retry", "aside"]
+
+
+@pytest.fixture
+def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most of what waits is only on disk."""
+    monkeypatch.setattr(module, "LOADED_SIZE", 1500)
+    monkeypatch.setattr(module, "LOADED_SHARE", 300)
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("seed", range(20))
+def test_like_a_list(seed: int) -> None:
+    twin = Twin(seed, MIXED)
+    for _ in range(300):
+        operation = twin.choose.choice(OPERATIONS)
+        if operation != "next" or twin.online:
+            getattr(twin, operation)()
+            twin.check()
+    if seed % 2:
+        twin.drain()
+    else:
+        twin.kill()
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("seed", range(20))
+def test_like_a_full_list(seed: int) -> None:
+    twin = Twin(seed, PLAIN, size=4_000)
+    for _ in range(300):
+        operation = twin.choose.choice(OPERATIONS + ["offer"] * 10)
+        if operation != "next" or twin.online:
+            getattr(twin, operation)()
+            twin.check()
+    if seed % 2:
+        twin.drain()
+    else:
+        twin.kill()
