@@ -63,9 +63,7 @@ class Acknowledgements:
 
     def wait(self, committed: int) -> bool:
         """Hold them back if they depend on a later batch than `committed`."""
-        waiting, batch = self._waiting, self._batch
-        if waiting and waiting[-1][0] > batch:
-            batch = waiting[-1][0]
+        waiting, batch = self._waiting, self._batch  # which only grows, so the order is preserved
         if batch <= committed or self._link is None:
             return False
         out, self._out = self._out, []
