@@ -44,6 +44,7 @@ class Sent:
     kind: str
     qos: int
     retain: bool
+    at: float
     size: int = 0
     expires_at: float | None = None
     is_stored: bool = False
@@ -106,7 +107,7 @@ class Twin:
         kind = keep if keep != "auto" else "latest" if retain or not qos else "all"
         expires = choose.choice([None, None, None, 0.3, 5.0])
         waiting = self.waiting[of]
-        sent = Sent(name, of, topic, kind, qos, retain)
+        sent = Sent(name, of, topic, kind, qos, retain, self.now)
         sent.expires_at = None if expires is None else self.now + expires
         if kind == "none" and not self.online:
             assert self.link.offer(name, topic, qos, of=of, retain=retain) is None
@@ -297,7 +298,7 @@ class Twin:
                 assert full, (queue, dropped)
                 full -= 1
                 if queue.first():
-                    self.remove(of, queue.first()[0])
+                    self.remove(of, min(queue.first(), key=lambda each: each.at))
                 else:
                     assert but is not None and but.of == of
                     but.size = -1
