@@ -1,4 +1,5 @@
-"""TLS for accepted connections, optimised for many connections with small messages.
+"""TLS for accepted connections, optimised for many connections with small messages; and for those
+that the appliance makes itself.
 
 asyncio and uvloop have TLS transports of their own. After each record they try to read another one,
 which ends in an exception and costs as much as the record itself, and they have a read buffer for
@@ -88,8 +89,35 @@ async def accept(
             del error
 
 
+async def connect(
+    connection: socket.socket,
+    context: ssl.SSLContext,
+    protocol: asyncio.Protocol,
+    timeout: float,
+    scheduler: LayerScheduler,
+    server_name: str,
+) -> None:
+    """Perform the client's handshake on a connection that was made, as `accept` does the server's.
+
+    `server_name` is whom the server's certificate has to be for; a name, not an IP address, is sent
+    to it as well (SNI, RFC 6066, section 3).
+
+    Raises:
+        As `accept`.
+    """
+    transport = TlsTransport(protocol, context, scheduler, socket.socket.close, server_name)
+    error = await transport.shake_hands(connection, timeout)
+    if error is not None:
+        try:
+            raise error
+        finally:
+            del error  # as above
+
+
 class TlsTransport:
     """A TLS connection: a protocol for its TCP connection, a transport for the protocol above.
+
+    It is the server's side, or with a `server_name` the client's.
 
     The plaintext of one chunk is handed on in one chunk, unless it has too many records, and before
     the end of the connection, or a broken record behind it, takes effect. As in asyncio, there are
@@ -105,6 +133,7 @@ class TlsTransport:
         context: ssl.SSLContext,
         scheduler: LayerScheduler,
         linger: Callable[[socket.socket], None] = socket.socket.close,
+        server_name: str | None = None,
     ) -> None:
         self._entries = scheduler.entries
         self._loop = self._entries.loop
@@ -122,7 +151,13 @@ class TlsTransport:
         self._queued = False
         self._incoming = ssl.MemoryBIO()
         self._outgoing = ssl.MemoryBIO()
-        self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
+        self._is_client = server_name is not None
+        self._tls = context.wrap_bio(
+            self._incoming,
+            self._outgoing,
+            server_side=not self._is_client,
+            server_hostname=server_name,
+        )
         self._tcp: asyncio.Transport
         self._connected = False  # `connection_made` was called
         self._open = False  # connected, and not closing
@@ -165,6 +200,10 @@ class TlsTransport:
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The TCP connection is there; in TLS the client speaks first."""
         self._tcp = cast(asyncio.Transport, transport)
+        if self._is_client:
+            with contextlib.suppress(ssl.SSLWantReadError):
+                self._tls.do_handshake()
+            self._flush()
 
     def data_received(self, data: bytes) -> None:
         """Decrypt a chunk and hand it on, now or in a turn."""

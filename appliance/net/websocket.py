@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 from websockets.exceptions import NegotiationError, PayloadTooBig
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request, Response
+from websockets.protocol import Protocol as FrameProtocol
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
@@ -45,8 +46,8 @@ FRAMES_A_TURN = 256
 _NOTHING = memoryview(b"")
 
 # The library logs every connection; what is of interest is logged here, with the address.
-_library_log = logging.getLogger(f"{__name__}.frames")
-_library_log.setLevel(logging.ERROR)
+library_log = logging.getLogger(f"{__name__}.frames")
+library_log.setLevel(logging.ERROR)
 
 
 class WebSocketHandler(UpperLayer, Protocol):
@@ -89,23 +90,23 @@ class WebSocketHandler(UpperLayer, Protocol):
         """Count an exception that escaped and end the connection; never raises."""
 
 
-class WebSocket(asyncio.Transport, asyncio.Protocol):
-    """A protocol for the transport below, and a transport for the `protocol` above.
+class WebSocketLayer(asyncio.Transport, asyncio.Protocol):
+    """A protocol for the transport below, and a transport for the `protocol` above: either side.
 
     The protocol above reads and writes bytes, with the flow control of the transport below. It
     receives a message in the fragments in which it arrives, and none while it has paused reading.
-
-    The Origin header is not checked: no browser adds an MQTT password by itself.
     """
 
-    def __init__(self, protocol: WebSocketHandler, scheduler: LayerScheduler) -> None:
+    def __init__(
+        self, protocol: WebSocketHandler, scheduler: LayerScheduler, frames: FrameProtocol
+    ) -> None:
         super().__init__()
         self._protocol = protocol
         self._scheduler = scheduler
         self._queued = False
         self._frames_left = FRAMES_A_TURN
-        self._frames = _Frames(logger=_library_log)
-        #: The HTTP request, until it is complete.
+        self._frames = frames
+        #: The head of the HTTP request or response, until it is complete.
         self._head = bytearray()
         #: What was received and is not decoded yet.
         self._backlog = _NOTHING
@@ -207,66 +208,8 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
             self._transport.resume_reading()
 
     def _receive_head(self, data: bytes) -> bytes:
-        """Answer the HTTP request once it is complete; returns the bytes behind it."""
-        head = self._head
-        head += data
-        end = head.find(b"\r\n\r\n", max(0, len(head) - len(data) - 3)) + 4
-        if not head[:1].isupper():
-            self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
-        elif end > 3:
-            self._scheduler.count_cost(HEAD_COST, self._protocol)
-            # The library would read frames before it answers the request, so it gets them
-            # afterwards.
-            self._frames.receive_data(bytes(head[:end]))
-            behind = bytes(head[end:])
-            head.clear()
-            if self._upgrade():
-                return behind
-        elif len(head) > HEAD_LIMIT:
-            self._refuse(431, f"the request's head is longer than {HEAD_LIMIT} bytes")
-        return b""
-
-    def _upgrade(self) -> bool:
-        frames = self._frames
-        events = frames.events_received()
-        if not events:
-            error = frames.handshake_exc and frames.handshake_exc.__cause__
-            self._refuse(400, f"not a WebSocket request: {error}")
-            return False
-        request = cast(Request, events[0])
-        if request.path.partition("?")[0] != PATH:
-            self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
-            return False
-        size = 0
-        for name, value in request.headers.raw_items():
-            if not name.lower().startswith(_OWN_HEADERS):
-                continue
-            # The library fails on what is not ASCII in these headers.
-            if not value.isascii():
-                self._refuse(400, f"not a WebSocket request: {name} holds what is not ASCII")
-                return False
-            size += len(value)
-            if size > OWN_HEADERS_LIMIT:
-                what = f"{name} and the like hold more than {OWN_HEADERS_LIMIT} bytes"
-                self._refuse(400, f"not a WebSocket request: {what}")
-                return False
-        response = frames.accept(request)
-        if response.status_code != 101:
-            self._send_refusal(response, str(frames.handshake_exc))
-            return False
-        frames.send_response(response)
-        self._send(frames.data_to_send())
-        return True
-
-    def _refuse(self, status: int | None, reason: str, path: str | None = None) -> None:
-        response = None if status is None else self._frames.reject(status, f"{reason}\n")
-        self._send_refusal(response, reason if path is None else f"{path!r}: {reason}")
-
-    def _send_refusal(self, response: Response | None, reason: str) -> None:
-        self._protocol.log_refusal("no WebSocket connection", reason)
-        if response is not None:
-            self._transport.write(response.serialize())
-        self._protocol.close()
+        """Take the peer's HTTP head; returns the bytes behind it once it is complete and right."""
+        raise NotImplementedError
 
     def _receive_frames(self, data: bytes) -> None:
         frames = self._frames
@@ -403,7 +346,91 @@ class WebSocket(asyncio.Transport, asyncio.Protocol):
         return self._transport.get_extra_info(name, default)
 
 
-class _Frames(ServerProtocol):
+class WebSocket(WebSocketLayer):
+    """The server's side.
+
+    The Origin header is not checked: no browser adds an MQTT password by itself.
+    """
+
+    _frames: _Frames
+
+    def __init__(self, protocol: WebSocketHandler, scheduler: LayerScheduler) -> None:
+        super().__init__(protocol, scheduler, _Frames(logger=library_log))
+
+    def _receive_head(self, data: bytes) -> bytes:
+        """Answer the HTTP request once it is complete; returns the bytes behind it."""
+        head = self._head
+        head += data
+        end = head.find(b"\r\n\r\n", max(0, len(head) - len(data) - 3)) + 4
+        if not head[:1].isupper():
+            self._refuse(None, "what it sent is not HTTP; is it meant for a listener without it?")
+        elif end > 3:
+            self._scheduler.count_cost(HEAD_COST, self._protocol)
+            # The library would read frames before it answers the request, so it gets them
+            # afterwards.
+            self._frames.receive_data(bytes(head[:end]))
+            behind = bytes(head[end:])
+            head.clear()
+            if self._upgrade():
+                return behind
+        elif len(head) > HEAD_LIMIT:
+            self._refuse(431, f"the request's head is longer than {HEAD_LIMIT} bytes")
+        return b""
+
+    def _upgrade(self) -> bool:
+        frames = self._frames
+        events = frames.events_received()
+        if not events:
+            error = frames.handshake_exc and frames.handshake_exc.__cause__
+            self._refuse(400, f"not a WebSocket request: {error}")
+            return False
+        request = cast(Request, events[0])
+        if request.path.partition("?")[0] != PATH:
+            self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
+            return False
+        size = 0
+        for name, value in request.headers.raw_items():
+            if not name.lower().startswith(_OWN_HEADERS):
+                continue
+            # The library fails on what is not ASCII in these headers.
+            if not value.isascii():
+                self._refuse(400, f"not a WebSocket request: {name} holds what is not ASCII")
+                return False
+            size += len(value)
+            if size > OWN_HEADERS_LIMIT:
+                what = f"{name} and the like hold more than {OWN_HEADERS_LIMIT} bytes"
+                self._refuse(400, f"not a WebSocket request: {what}")
+                return False
+        response = frames.accept(request)
+        if response.status_code != 101:
+            self._send_refusal(response, str(frames.handshake_exc))
+            return False
+        frames.send_response(response)
+        self._send(frames.data_to_send())
+        return True
+
+    def _refuse(self, status: int | None, reason: str, path: str | None = None) -> None:
+        response = None if status is None else self._frames.reject(status, f"{reason}\n")
+        self._send_refusal(response, reason if path is None else f"{path!r}: {reason}")
+
+    def _send_refusal(self, response: Response | None, reason: str) -> None:
+        self._protocol.log_refusal("no WebSocket connection", reason)
+        if response is not None:
+            self._transport.write(response.serialize())
+        self._protocol.close()
+
+
+class EachFrame(FrameProtocol):
+    """Hands on each frame; no message is assembled, and so the size limit is per frame."""
+
+    def recv_frame(self, frame: Frame) -> None:
+        """Receive a frame."""
+        super().recv_frame(frame)
+        if self.cur_size:
+            self.cur_size = 0
+
+
+class _Frames(EachFrame, ServerProtocol):
     """The protocol of the `websockets` library, without I/O."""
 
     def select_subprotocol(self, subprotocols: Sequence[Subprotocol]) -> Subprotocol:
@@ -412,9 +439,3 @@ class _Frames(ServerProtocol):
             if subprotocol in SUBPROTOCOLS:
                 return subprotocol
         raise NegotiationError(f"offer the subprotocol {' or '.join(SUBPROTOCOLS)}")
-
-    def recv_frame(self, frame: Frame) -> None:
-        """Receive a frame; the size limit is per frame, as no message is assembled."""
-        super().recv_frame(frame)
-        if self.cur_size:
-            self.cur_size = 0
