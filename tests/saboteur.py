@@ -231,8 +231,9 @@ class Saboteur:
         monkeypatch.setattr(entries.PeriodicCallback, "__init__", repeated)
         monkeypatch.setattr(entries._ContainedProxy, "__init__", shielded)
         monkeypatch.setattr(Faults, "run", ran)
-        for name in ("connection", "tls", "websocket"):
-            module = importlib.import_module(f"appliance.net.{name}")
+        names = ("net.connection", "net.tls", "net.websocket")
+        for name in (*names, "upstream.transport", "upstream.websocket_client"):
+            module = importlib.import_module(f"appliance.{name}")
             for kind in vars(module).values():
                 if isinstance(kind, type) and kind.__module__ == module.__name__:
                     for method in vars(kind).values():

@@ -866,6 +866,22 @@ ELSEWHERE = {
         ),
         "ros/ros2/test_ros2_contained.py",
     ),
+    **dict.fromkeys(
+        (
+            "dial.abandoned",
+            "dial.step",
+            "dial.thread",
+            "upstream.chunk",
+            "upstream.cut",
+            "upstream.eof",
+            "upstream.look",
+            "upstream.lost",
+            "upstream.made",
+            "upstream.pause",
+            "upstream.resume",
+        ),
+        "upstream/test_dial.py",
+    ),
     "stop.session": "test_containment.py",
     "store.read": "store/test_memory_backlogs.py",
 }

@@ -31,7 +31,12 @@ class ServerUrl(NamedTuple):
     path: str = ""
 
     def __str__(self) -> str:
-        return f"{self.scheme}://{_authority(self.host, self.port)}{self.path}"
+        return f"{self.scheme}://{self.authority}{self.path}"
+
+    @property
+    def authority(self) -> str:
+        """`host:port`; an IPv6 address is in brackets."""
+        return _authority(self.host, self.port)
 
     @property
     def tls(self) -> bool:
@@ -53,7 +58,12 @@ class ProxyUrl(NamedTuple):
     password: str | None = None
 
     def __repr__(self) -> str:
-        return f"ProxyUrl({_authority(self.host, self.port)})"
+        return f"ProxyUrl({self.authority})"
+
+    @property
+    def authority(self) -> str:
+        """`host:port`, without the user and the password."""
+        return _authority(self.host, self.port)
 
 
 def parse_server(value: object) -> ServerUrl:
