@@ -868,6 +868,19 @@ ELSEWHERE = {
     ),
     **dict.fromkeys(
         (
+            "upstream.check",
+            "upstream.clock",
+            "upstream.dial",
+            "upstream.offer",
+            "upstream.ping",
+            "upstream.restart",
+            "upstream.send",
+            "upstream.turn",
+        ),
+        "upstream/test_uplink_contained.py",
+    ),
+    **dict.fromkeys(
+        (
             "dial.abandoned",
             "dial.step",
             "dial.thread",

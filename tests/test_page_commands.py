@@ -57,6 +57,7 @@ STAND_INS = (
     # The test may not be root: then it is a trial. Else `DESTDIR` names an image of a system.
     ("sudo appliance ", "single-file "),
     ("appliance bench", "short-bench bench"),
+    ("//broker.example", "//127.0.0.1:1"),  # nobody listens there
     ("--host robot.local", "--host localhost --port {port}"),
     (" … ", " -h localhost -p {port} --cafile certs/ca.crt -u {user} -P {password} "),
     # ROS's packages on PyPI have no navigation: the action is a Fibonacci.
@@ -90,7 +91,7 @@ command.GROWTH = tuple(
 
 #: Commands that are for a running appliance, and those that want it stopped; others do not mind.
 NEED_RUNNING = re.compile(
-    r"appliance (status|reload|routes|doctor|pub|sub|call|goal|param) |mosquitto_"
+    r"appliance (status|reload|routes|upstream|doctor|pub|sub|call|goal|param) |mosquitto_"
 )
 NEED_STOPPED = re.compile(r"appliance (run|store) |make run ")
 #: They run until they are stopped.

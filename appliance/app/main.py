@@ -53,6 +53,8 @@ from appliance.ros.ros1.node import Ros1Node
 from appliance.ros.ros2 import discovery
 from appliance.ros.ros2.node import Ros2Node
 from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
+from appliance.upstream import settings as upstream_settings
+from appliance.upstream.uplink import Uplink, UplinkParts
 
 log = logging.getLogger(__name__)
 
@@ -103,6 +105,7 @@ class App:
         self._crashes = crashes
         self.addresses: list[tuple[str, int]] = []
         self.bridge: Bridge | None = None
+        self.upstreams: list[Uplink] = []
         self.audit: Audit | None = None
         self._stack = contextlib.AsyncExitStack()
         self._stopping = asyncio.Event()
@@ -187,6 +190,7 @@ class App:
             await plugins.start()
             self._stack.push_async_callback(plugins.shutdown)
         self._start_bridge(loop)
+        self._start_upstreams(store)
         self._reload = Reload(
             ReloadParts(settings, access, tls, broker, listeners, self.bridge, self.audit)
         )
@@ -197,6 +201,7 @@ class App:
                 listeners,
                 store,
                 self.bridge,
+                self.upstreams,
                 self._reload,
                 tls.warnings if tls is not None else list,
                 self._crashes.previous if self._crashes is not None else None,
@@ -302,6 +307,15 @@ class App:
         self._stack.push_async_callback(self.bridge.stop)
         self.bridge.start()
 
+    def _start_upstreams(self, store: SessionStore) -> None:
+        """Connect to the fleets' brokers in the background."""
+        parts = UplinkParts(self.broker, self._entries, store.backlogs, self._listeners.scheduler)
+        for settings in upstream_settings.upstreams(self.settings):
+            uplink = Uplink(settings, parts)
+            self._stack.push_async_callback(uplink.stop)
+            uplink.start()
+            self.upstreams.append(uplink)
+
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tick every TICK seconds; publish `$SYS` every `broker.sys_interval`."""
         process = psutil.Process()
@@ -341,6 +355,8 @@ class App:
         text = f"the computer's clock was set {'forward' if step > 0 else 'back'} by "
         text += f"{timedelta(seconds=round(abs(step)))}"
         log.warning("%s, or the computer slept: nothing expires by that", text)
+        for uplink in self.upstreams:
+            uplink.clock_was_set()
         if self.audit is not None:
             self.audit.changed(text)
         self._certificates_due.set()
@@ -408,6 +424,9 @@ class App:
         topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
         return topics + [dict(entry) for entry in bridge.calls.bridged()]
 
+    async def _answer_upstream(self) -> list[dict[str, object]]:
+        return [{**uplink.status().as_json(), "aside": uplink.aside()} for uplink in self.upstreams]
+
     async def _answer_skipped(self) -> list[dict[str, object]]:
         return [asdict(skip) for skip in self._running_bridge().skips()]
 
@@ -431,6 +450,7 @@ class App:
             "routes": self._answer_routes,
             "status": self._answer_status,
             "skipped": self._answer_skipped,
+            "upstream": self._answer_upstream,
         }
         control = Control(settings.control, commands, self.broker.faults)
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from operator import attrgetter
@@ -26,6 +26,8 @@ from appliance.ros.bridge import Bridge
 from appliance.ros.metrics import Meter
 from appliance.ros.status import RouteStatus
 from appliance.store import SessionStore
+from appliance.upstream.status import warnings_of as upstream_warnings
+from appliance.upstream.uplink import Uplink
 
 #: The part of a limit from which on its use is reported, with the users that hold most of it.
 NEARLY_FULL = 0.8
@@ -43,6 +45,7 @@ class StatusParts:
     listeners: Listeners
     store: SessionStore
     bridge: Bridge | None
+    upstreams: Sequence[Uplink]
     reload: Reload
     warnings: Callable[[], list[str]]
     #: The crash report of the last run, if it crashed.
@@ -101,6 +104,7 @@ class Status:
             "short": list(self._short()),
             "ros": ros,
             "routes": routes,
+            "upstreams": [uplink.status().as_json() for uplink in parts.upstreams],
             "reload": self._reload(),
             "errors": self._errors(),
         }
@@ -296,6 +300,9 @@ class Status:
             yield f"ROS: {problem}"
         elif problem:
             yield f"there is no bridge to ROS: {problem}"
+        for upstream in report["upstreams"]:
+            for text in upstream_warnings(upstream):
+                yield f"upstream {upstream['name']}: {text}"
         if self._parts.crash is not None:
             yield f"the last run crashed, see {self._parts.crash}"
         errors = report["errors"]

@@ -94,6 +94,8 @@ def _lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "routes", f"{routes['count']}, which carry {routes['bridged']} topics and calls now"
     for sick in routes["sick"]:
         yield "", f"{sick['route']}: {sick['problem']}"
+    for number, link in enumerate(report["upstreams"]):
+        yield "" if number else "upstreams", _upstream(link)
     yield "last reload", _reload(report["reload"])
     for number, each in enumerate(report["certificates"]):
         left = f"{each['days']} days left" if each["days"] >= 0 else "has run out"
@@ -119,6 +121,15 @@ def _ros(report: dict[str, Any]) -> str:
         return "is being joined"
     state = "was lost" if report["state"] == "lost" else "is not there yet"
     return f"{state}, and tried again: {report['problem']}"
+
+
+def _upstream(link: dict[str, Any]) -> str:
+    state = "connected to" if link["connected"] else "NOT connected to"
+    text = f"{link['name']}: {state} {link['server']}"
+    if link["waiting"]:
+        oldest = "" if link["oldest"] is None else f", the oldest for {link['oldest']:.0f} s"
+        text += f"; {link['waiting']} messages wait ({_size(link['waiting_bytes'])}{oldest})"
+    return text
 
 
 def _reload(report: dict[str, Any] | None) -> str:

@@ -106,8 +106,6 @@ class OutSession:
         #: What these sessions publish comes from there, and is not sent back.
         self._own = frozenset((in_client_id(name), kept_client_id(name), answers_client_id(name)))
         self._filters = rules.out_filters
-        #: Answers go before all else, and none replaces another. The backlog knows it as a rule.
-        self.answer_rule = OutRule("+", settings.answers_here, "", "all", "high")
         self._session: Session | None = None
         self._answering: Session | None = None
         #: Whether filters that are not subscribed to are asked about in the next turn.
@@ -121,7 +119,7 @@ class OutSession:
         self._answering = self._broker.attach(
             answers_client_id(self._settings.name), _AnswerLink(self)
         )
-        wanted = Subscription(self.answer_rule.local_filter, 0, retain_handling=2)
+        wanted = Subscription(self._rules.answers.local_filter, 0, retain_handling=2)
         self._broker.subscribe(self._answering, wanted)
         self._subscribe(self._session)
 
@@ -211,7 +209,7 @@ class OutSession:
             return  # a loop: what came from there is no answer to it
         topic = self._answers.for_answer_out(message.topic, self._broker.now)
         if topic is not None:
-            self._offer(self.answer_rule, topic, message)
+            self._offer(self._rules.answers, topic, message)
 
     def _offer(self, rule: OutRule, topic: str, message: Message) -> None:
         """Hand the message to the backlog; its publisher is told if that does not take it."""

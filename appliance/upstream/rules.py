@@ -282,6 +282,8 @@ class LinkRules:
 
     def __init__(self, settings: UpstreamSettings) -> None:
         self._settings = settings
+        #: Of answers to requests from there: they go before all else, and none replaces another.
+        self.answers = OutRule("+", settings.answers_here, "", "all", "high")
         self._out = _Lookup(settings.out, lambda rule: rule.local_filter, self._to_remote)
         self._in = _Lookup(settings.inward, lambda rule: rule.remote_filter, self._to_local)
 

@@ -23,6 +23,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Literal
 
+from harness import abort
 from waiting import until
 
 from appliance.mqtt.codec import V5, V311, Properties, Property, decode_varint
@@ -136,7 +137,7 @@ class Visit:
         sock = self.writer.get_extra_info("socket")
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RST)
-        self.writer.transport.abort()
+        abort(self.writer.transport)
 
     def later(self, work: Awaitable[None]) -> None:
         """Do that beside what else is done on this connection, as long as it lasts."""

@@ -172,9 +172,8 @@ async def test_many_cancels_of_one_user_do_not_block_those_of_another(harness):
 async def test_the_clients_without_a_user_are_one_user(harness):
     slow = await begin(harness, CallLimits(client=2, total=8))
     crowd = [harness.client(f"nobody{number}") for number in range(3)]
-    nobody = harness.broker.accounting.accounts.of(Identity(None, "nobody"))
     for client in crowd:
-        client.session.account = nobody
+        client.session.identity = Identity(None, client.session.client_id)
     for client in crowd[:2]:
         client.send(f"{CALL}/1", {"data": True})
     await until(lambda: len(slow.waiting) == 2, "the calls")
@@ -404,6 +403,7 @@ class Clock:
 class Who:
     def __init__(self, user):
         self.account = Account(user)
+        self.identity = Identity(user, "client")
 
 
 LARGE = turns.LITTLE + 1

@@ -1,0 +1,201 @@
+"""Sends what waits in a backlog, and sets aside what the fleet's broker will never take."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+from typing import Final
+
+from appliance.mqtt.codec import (
+    NO_PROPERTIES,
+    V5,
+    Properties,
+    Property,
+    decode_varint,
+    encode_property_list,
+    encode_varint,
+    quote,
+    reason_name,
+)
+from appliance.mqtt.reason import ReasonCode
+from appliance.upstream.agreement import EndedBy, Ending
+from appliance.upstream.backlog import Backlog
+from appliance.upstream.limits import FleetLimits
+from appliance.upstream.link import FleetConnection
+from appliance.upstream.rule_queue import Entry
+from appliance.upstream.transport import WRITE_PORTION
+
+log = logging.getLogger(__name__)
+
+#: Messages that are sent in one turn of the event loop: two milliseconds of work, then others have
+#: theirs.
+SENT_PER_TURN: Final = 256
+
+#: Bytes of a PUBLISH beside its topic, properties and payload, at most.
+HEADER_SIZE: Final = 16
+
+#: Reason codes with which the broker says that it will never take a message.
+POISON: Final = frozenset(
+    (
+        ReasonCode.NOT_AUTHORIZED,
+        ReasonCode.TOPIC_NAME_INVALID,
+        ReasonCode.PACKET_TOO_LARGE,
+        ReasonCode.PAYLOAD_FORMAT_INVALID,
+    )
+)
+
+#: A message is set aside when the broker has closed the connection so often on it, sent alone.
+#: Messages are sent alone after so many connections that ended without any progress.
+CLOSED_ON: Final = 3
+WITHOUT_PROGRESS: Final = 2
+
+_ID: Final = "id"
+_PUBLISHED_AT: Final = "published-at"
+
+
+class Sender:
+    """Hands messages of a backlog to connections, one after the other.
+
+    `clock` is that of the backlog's journals.
+    """
+
+    def __init__(
+        self, name: str, backlog: Backlog, clock: Callable[[], float], limits: FleetLimits
+    ) -> None:
+        self._name = name
+        self._backlog = backlog
+        self._clock = clock
+        self._limits = limits
+        #: The oldest message in flight when the last connection ended, and of how many in a row
+        #: that was so.
+        self._stuck_on = -1
+        self._stuck = 0
+        #: Messages that are still to be sent one at a time; and the one that was sent alone when
+        #: the broker closed the connection, and how often it did.
+        self._careful = 0
+        self._closed_on = -1
+        self._closed = 0
+
+    def begin(self, limits: FleetLimits) -> None:
+        """A connection is up, with these limits."""
+        self._limits = limits
+        self._backlog.connected()
+
+    def send(self, connection: FleetConnection[Entry | None]) -> bool:
+        """Hand messages to the connection; True if there may be more for another turn."""
+        now = self._clock()
+        for _ in range(SENT_PER_TURN):
+            if not connection.room or (self._careful and connection.inflight):
+                return False
+            if connection.waiting >= WRITE_PORTION:
+                return True
+            entry = self._backlog.next(now)
+            if entry is None:
+                return False
+            self._publish(connection, entry, now)
+        return True
+
+    def due(self) -> float | None:
+        """Seconds until there may be something to send; None if that is unknown."""
+        now = self._clock()
+        due = self._backlog.due(now)
+        return None if due is None else max(0.0, due - now)
+
+    def _publish(self, connection: FleetConnection[Entry | None], entry: Entry, now: float) -> None:
+        record = entry.record
+        is_v5 = connection.settings.version == V5
+        properties = _properties(entry, now) if is_v5 else NO_PROPERTIES
+        size = HEADER_SIZE + len(record.topic) + len(properties) + len(record.payload)
+        why = self._limits.unsendable(record.topic, size)
+        if why:
+            self._set_aside(entry, f"the fleet's broker does not take it: {why}")
+            return
+        qos = min(entry.qos, self._limits.qos)
+        retain = record.retain and self._limits.retain
+        code = connection.publish(entry, record.topic, record.payload, qos, retain, properties)
+        if code:
+            self._set_aside(entry, f"the fleet's broker does not take it: {reason_name(code)}")
+        elif not qos:
+            self._backlog.settle(entry)
+
+    def acknowledged(self, entries: Sequence[Entry | None], code: int, reason: str) -> None:
+        """Messages were acknowledged, or refused with a code of 0x80 or above."""
+        self._stuck = 0
+        for entry in entries:
+            if entry is None:
+                continue
+            if code < 0x80:
+                self._backlog.settle(entry)
+            elif code in POISON:
+                text = f"the fleet's broker refuses it: {reason_name(code)}"
+                self._set_aside(entry, f"{text}, {quote(reason)}" if reason else text)
+            else:
+                self._backlog.retry_later(entry, self._clock())
+            if self._careful:
+                self._careful -= 1
+
+    def end(self, ending: Ending, inflight: Sequence[Entry | None]) -> None:
+        """The connection has ended with these messages in flight: they are sent again."""
+        first = next((entry for entry in inflight if entry is not None), None)
+        if first is not None and _may_be_poison(ending):
+            self._suspect(first, len(inflight), ending)
+        self._backlog.rewind()
+
+    def _suspect(self, first: Entry, suspects: int, ending: Ending) -> None:
+        """The broker has closed the connection: perhaps because of one of the messages."""
+        number = first.record.number
+        if self._careful:
+            self._closed = self._closed + 1 if self._closed_on == number else 1
+            self._closed_on = number
+            if self._closed >= CLOSED_ON:
+                self._set_aside(
+                    first,
+                    f"the fleet's broker has closed the connection {self._closed} times when it "
+                    f"was sent this message alone; the last time: {ending.text}",
+                )
+                self._careful = self._closed = 0
+            return
+        self._stuck = self._stuck + 1 if self._stuck_on == number else 1
+        self._stuck_on = number
+        if self._stuck >= WITHOUT_PROGRESS:
+            self._careful = suspects
+
+    def _set_aside(self, entry: Entry, reason: str) -> None:
+        log.warning(
+            "upstream '%s': a message for %s is set aside: %s",
+            self._name,
+            quote(entry.record.topic),
+            reason,
+        )
+        self._backlog.set_aside(entry, reason, self._clock())
+
+
+def _may_be_poison(ending: Ending) -> bool:
+    """Whether the connection may have ended because of what the broker was sent: it has closed it,
+    it has answered nonsense, or we could not go on."""
+    if ending.by is EndedBy.US:
+        return ending.code >= 0x80
+    return ending.code != ReasonCode.SERVER_SHUTTING_DOWN
+
+
+def _properties(entry: Entry, now: float) -> bytes:
+    """The encoded properties of a message, with those that depend on when it is sent."""
+    record = entry.record
+    more: Properties = {}
+    pairs: list[tuple[str, str]] = []
+    if entry.expiry is not None:
+        more[Property.MESSAGE_EXPIRY_INTERVAL] = entry.expiry
+    if record.qos == 2:
+        pairs.append((_ID, f"{record.number:x}"))
+    if entry.published_at is not None:
+        at = datetime.fromtimestamp(time.time() - (now - entry.published_at), timezone.utc)
+        pairs.append((_PUBLISHED_AT, at.isoformat(timespec="milliseconds")))
+    if pairs:
+        more[Property.USER_PROPERTY] = pairs
+    wire = record.properties_wire
+    if not more:
+        return wire
+    inside = wire[decode_varint(wire, 0)[1] :] + encode_property_list(more)
+    return encode_varint(len(inside)) + inside

@@ -1,0 +1,98 @@
+"""How a link is: for `appliance upstream`, `appliance status`, and the topics that tell it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+#: Seconds over which rates are measured.
+SECONDS: Final = 10
+
+
+@dataclass(slots=True)
+class LinkStatus:
+    """The state of a link; times in seconds, sizes in bytes.
+
+    `problem` is why it is not connected, or what is wrong although it is. `waiting` messages are
+    not acknowledged by the fleet's broker yet; the oldest is `oldest` seconds old. `dropped` is by
+    rule and reason, both ways.
+    """
+
+    name: str
+    kind: str
+    connected: bool = False
+    server: str = ""
+    version: str = ""
+    client_id: str = ""
+    since: float | None = None
+    problem: str | None = None
+    attempts: int = 0
+    connections: int = 0
+    round_trip: float | None = None
+    window: int = 0
+    inflight: int = 0
+    waiting: int = 0
+    waiting_bytes: int = 0
+    oldest: float | None = None
+    sent: int = 0
+    sent_a_second: float = 0.0
+    offered: int = 0
+    offered_a_second: float = 0.0
+    received: int = 0
+    delivered: int = 0
+    refused: int = 0
+    dropped: dict[str, dict[str, int]] = field(default_factory=dict)
+    set_aside: int = 0
+    refused_filters: list[str] = field(default_factory=list)
+    denied: dict[str, str] = field(default_factory=dict)
+    advice: str | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it as JSON values."""
+        return asdict(self)
+
+
+def warnings_of(status: dict[str, Any]) -> Iterator[str]:
+    """What a person should know of a link, from its status as JSON values."""
+    if status["problem"]:
+        yield status["problem"]
+    if status["advice"]:
+        yield status["advice"]
+    for name, reason in status["denied"].items():
+        yield f"the access rules do not let it read {name}: {reason}"
+    for name in status["refused_filters"]:
+        yield f"the fleet's broker refuses the subscription to {name}"
+    if status["set_aside"]:
+        yield f"messages that the fleet's broker never takes were set aside: {status['set_aside']}"
+
+
+def bottleneck(status: LinkStatus) -> str | None:
+    """Why the link cannot carry all that comes, if the window is the reason."""
+    if not (status.connected and status.window and status.round_trip):
+        return None
+    allowed = status.window / status.round_trip
+    if status.inflight < status.window or status.offered_a_second <= allowed:
+        return None
+    return (
+        f"Receive Maximum {status.window} at {status.round_trip * 1000:.0f} ms allows "
+        f"{allowed:.0f} a second; {status.offered_a_second:.0f} come"
+    )
+
+
+class Rates:
+    """Messages a second of what was offered and sent, over the last seconds."""
+
+    def __init__(self) -> None:
+        self.offered = 0.0
+        self.sent = 0.0
+        self._seen: deque[tuple[float, int, int]] = deque(maxlen=SECONDS)
+
+    def tick(self, now: float, offered: int, sent: int) -> None:
+        """Take the counters as they are now; about once a second."""
+        self._seen.append((now, offered, sent))
+        at, first_offered, first_sent = self._seen[0]
+        if now > at:
+            self.offered = round((offered - first_offered) / (now - at), 1)
+            self.sent = round((sent - first_sent) / (now - at), 1)

@@ -1,0 +1,592 @@
+"""A link to a fleet's broker: it dials, sends what waits, receives, and reports how it is.
+
+An `Uplink` lives as long as its section in appliance.yaml, connected or not. Its backlog and its
+session for what is sent exist all the time, a `Channel` while a connection does. Rules with
+`offline: keep` have a connection of their own, whose session the fleet's broker keeps.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import random
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import orjson
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.ports import Backlogs
+from appliance.config.urls import parse_proxy
+from appliance.mqtt.codec import V5, V311, Properties, Property, quote, reason_name
+from appliance.mqtt.packets import Subscription, Will
+from appliance.mqtt.reason import ReasonCode
+from appliance.net.callbacks import Entries, PeriodicCallback
+from appliance.net.layers import LayerScheduler
+from appliance.upstream.agreement import ConnectSettings, EndedBy, Ending, Granted
+from appliance.upstream.answers import Answers, reply_filter
+from appliance.upstream.backlog import Backlog
+from appliance.upstream.backoff import Backoff
+from appliance.upstream.channel import Channel
+from appliance.upstream.credentials import Credentials, read_credentials
+from appliance.upstream.dial import dial, in_thread
+from appliance.upstream.dial_error import DialError
+from appliance.upstream.in_session import InCounters, InSession
+from appliance.upstream.limits import KINDS, FleetLimits, alpn
+from appliance.upstream.out_session import OutSession
+from appliance.upstream.rule_queue import Entry
+from appliance.upstream.rules import LinkRules, UpstreamSettings
+from appliance.upstream.sender import Sender
+from appliance.upstream.status import LinkStatus, Rates, bottleneck
+from appliance.upstream.transport import Surroundings
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at what has become too old, and between two reports of the metrics.
+TICK: Final = 1.0
+REPORT_INTERVAL: Final = 10.0
+
+#: Seconds for which the fleet's broker is asked to keep the session of rules with `offline: keep`.
+KEPT_EXPIRY: Final = 7 * 86400
+
+#: Seconds after a fault of the appliance until what has failed is tried again.
+AGAIN: Final = 1.0
+
+#: Seconds that the stop waits for a dial to be cancelled, at a time.
+CANCEL_TIMEOUT: Final = 2.0
+
+_JSON: Final[Properties] = {Property.CONTENT_TYPE: "application/json"}
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkParts:
+    """What a link needs of the appliance."""
+
+    broker: Broker
+    entries: Entries
+    backlogs: Backlogs
+    scheduler: LayerScheduler
+
+
+class Uplink:
+    """One link; on the event loop's thread."""
+
+    def __init__(self, settings: UpstreamSettings, parts: UplinkParts) -> None:
+        self.settings = settings
+        self.broker = parts.broker
+        self.entries = parts.entries
+        self._scheduler = parts.scheduler
+        self._loop = parts.entries.loop
+        self._rules = LinkRules(settings)
+        self._answers = Answers(settings)
+        self._journal_clock = parts.backlogs.journal(settings.name, 0).now
+        limits = KINDS[settings.kind]
+        rate, size = limits.rates(settings.rate, settings.bytes_per_second)
+        self._backlog = Backlog(
+            settings.name,
+            parts.backlogs,
+            (*settings.out, self._rules.answers),
+            settings.backlog,
+            self._journal_clock(),
+            self._wake,
+            rate=rate,
+            bytes_per_second=size,
+        )
+        self._sender = Sender(settings.name, self._backlog, self._journal_clock, limits)
+        self._out = OutSession(
+            self.broker,
+            settings,
+            self._rules,
+            self._answers,
+            self._backlog,
+            self._journal_clock,
+            self._offer_later,
+        )
+        self._in_counters = InCounters()
+        self._lines = [_Line(self, is_kept=False)]
+        if any(rule.offline == "keep" for rule in settings.inward):
+            self._lines.append(_Line(self, is_kept=True))
+        self._rates = Rates()
+        self._clock: PeriodicCallback | None = None
+        self._send_timer: asyncio.TimerHandle | None = None
+        self._offer_timer: asyncio.Handle | None = None
+        self._reported: bytes = b""
+        self._reported_at = 0.0
+
+    def __str__(self) -> str:
+        return f"upstream '{self.settings.name}'"
+
+    # --- its life ------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin to take messages, and to connect."""
+        self._out.attach()
+        self._out.take_turn()
+        self.broker.flush()
+        self._clock = self.entries.every("upstream.clock", TICK, self._tick)
+        for line in self._lines:
+            line.start()
+        self._report()
+
+    async def stop(self) -> None:
+        """Say that the robot is offline, and disconnect; what waits stays in the backlog."""
+        if self._clock is not None:
+            self._clock.cancel()
+        await asyncio.gather(*(line.stop() for line in self._lines))
+        for timer in (self._send_timer, self._offer_timer):
+            if timer is not None:
+                timer.cancel()
+        self._report()
+        self._out.detach()
+        self.broker.flush()
+
+    def _tick(self) -> None:
+        self._backlog.tick(self._journal_clock())
+        counts = self._backlog.counts()
+        self._rates.tick(self._loop.time(), counts.offered, counts.sent)
+        if self._loop.time() >= self._reported_at + REPORT_INTERVAL:
+            self._report()
+
+    # --- out -----------------------------------------------------------------------------------
+
+    def _offer_later(self) -> None:
+        if self._offer_timer is None:
+            self._offer_timer = self.entries.soon(
+                "upstream.offer", self._offer_more, failed=self._offer_again
+            )
+
+    def _offer_again(self) -> None:
+        """A fault: go on a little later."""
+        self._offer_timer = self.entries.later(
+            "upstream.offer", AGAIN, self._offer_more, failed=self._offer_again
+        )
+
+    def _offer_more(self) -> None:
+        self._offer_timer = None
+        self._out.take_turn()
+        self.broker.flush()
+
+    def _wake(self) -> None:
+        """The backlog has something to send again."""
+        self._send_later(0.0)
+
+    def _send_later(self, seconds: float) -> None:
+        when = self._loop.time() + seconds
+        if self._send_timer is not None:
+            if self._send_timer.when() <= when:
+                return
+            self._send_timer.cancel()
+        self._send_timer = self.entries.at(
+            "upstream.send", when, self._send, failed=self._send_again
+        )
+
+    def _send_again(self) -> None:
+        """A fault: go on a little later."""
+        self._send_timer = None
+        self._send_later(AGAIN)
+
+    def _send(self) -> None:
+        self._send_timer = None
+        channel = self._lines[0].channel
+        if channel is not None:
+            channel.send_on()
+
+    def send_more(self, channel: Channel) -> None:
+        """See `ChannelOwner`."""
+        if channel is not self._lines[0].channel or not channel.can_send:
+            return
+        if self._sender.send(channel.connection):
+            self._send_later(0.0)
+            return
+        due = self._sender.due()
+        if due is not None:
+            self._send_later(due)
+
+    def acknowledged(self, entries: list[Entry | None], code: int, reason: str) -> None:
+        """See `ChannelOwner`."""
+        self._sender.acknowledged(entries, code, reason)
+
+    # --- the connections -----------------------------------------------------------------------
+
+    def receive(self, channel: Channel) -> InSession:
+        """See `ChannelOwner`."""
+        answering = self._out.answering
+        assert answering is not None
+        return InSession(
+            self.broker,
+            self.settings,
+            self._rules,
+            self._answers,
+            answering,
+            channel,
+            self._in_counters,
+            is_kept=self._line_of(channel).is_kept,
+        )
+
+    def opened(self, channel: Channel) -> None:
+        """See `ChannelOwner`."""
+        line = self._line_of(channel)
+        line.on_opened(channel)
+        if line.is_kept:
+            return
+        granted = channel.connection.granted
+        assert granted is not None
+        self._out.version = channel.version
+        self._sender.begin(granted_limits(KINDS[self.settings.kind], granted, channel.version))
+
+    def subscribed(self, channel: Channel, refused: list[tuple[Subscription, int]]) -> None:
+        """See `ChannelOwner`."""
+        line = self._line_of(channel)
+        line.refused_filters = [each.filter for each, _ in refused]
+        for each, code in refused:
+            log.warning(
+                "%s: the fleet's broker refuses the subscription to %s: %s",
+                self,
+                quote(each.filter),
+                reason_name(code),
+            )
+        if not line.is_kept:
+            self._publish_state(channel, b"online")
+        self._report()
+
+    def ended(self, channel: Channel, ending: Ending) -> None:
+        """See `ChannelOwner`."""
+        line = self._line_of(channel)
+        try:
+            if not line.is_kept:
+                self._sender.end(ending, channel.connection.unsettled())
+        finally:
+            line.on_ended(channel, ending)
+        self._report()
+
+    def _line_of(self, channel: Channel) -> _Line:
+        return self._lines[channel.is_kept]
+
+    def _publish_state(self, channel: Channel, state: bytes) -> None:
+        """Say there whether the robot is online; the will says when it is not any more."""
+        connection = channel.connection
+        granted = connection.granted
+        if granted is None:
+            return
+        limits = KINDS[self.settings.kind]
+        qos = min(1, granted.maximum_qos)
+        retain = granted.retain and limits.retain
+        connection.publish(None, self.settings.state_there, state, qos, retain)
+
+    def connect_settings(
+        self, version: int, credentials: Credentials, *, is_kept: bool
+    ) -> ConnectSettings:
+        """What CONNECT asks for."""
+        settings = self.settings
+        limits = KINDS[settings.kind]
+        will = None
+        if not is_kept:
+            will = Will(settings.state_there, b"offline", min(1, limits.qos), limits.retain)
+        return ConnectSettings(
+            client_id=settings.client_id + ("-keep" if is_kept else ""),
+            version=version,
+            clean_start=not is_kept,
+            session_expiry=KEPT_EXPIRY if is_kept else 0,
+            keep_alive=limits.keep_alive(settings.keep_alive),
+            username=settings.login.username,
+            password=credentials.password,
+            will=will,
+            method=settings.login.method if version == V5 and limits.auth else None,
+            authentication_data=credentials.data if version == V5 else None,
+            window=min(settings.window, limits.window),
+            maximum_packet_size=self.broker.limits.packet_size,
+            user_properties=self.broker.limits.user_properties,
+            filters_per_packet=limits.filters or 100,
+        )
+
+    def subscriptions(self, version: int, *, is_kept: bool) -> list[Subscription]:
+        """What a connection subscribes to there."""
+        filters = self._rules.in_filters("keep" if is_kept else "drop")
+        if not is_kept:
+            if version == V5:
+                filters.append(self.settings.answers_there + "+")
+            else:
+                replies = (reply_filter(rule.remote_filter) for rule in self.settings.out)
+                filters += [each for each in replies if each is not None]
+        is_v5 = version == V5
+        return [
+            Subscription(each, 1, no_local=is_v5, retain_as_published=is_v5)
+            for each in dict.fromkeys(filters)
+        ]
+
+    def least_late(self, *, is_kept: bool) -> float | None:
+        """The least `late` of the rules on a connection."""
+        if is_kept:
+            return None
+        times = [
+            rule.late
+            for rule in self.settings.inward
+            if rule.offline == "drop" and rule.late is not None
+        ]
+        return min(times, default=None)
+
+    def surroundings(self) -> Surroundings:
+        """For the transport."""
+        broker = self.broker
+        account = broker.accounting.accounts.inside
+        return Surroundings(
+            self._scheduler,
+            account,
+            partial(broker.accounting.take, account),
+            broker.limits.packet_size,
+        )
+
+    # --- status --------------------------------------------------------------------------------
+
+    def status(self) -> LinkStatus:
+        """How the link is now."""
+        settings, line = self.settings, self._lines[0]
+        counts = self._backlog.counts()
+        status = LinkStatus(settings.name, settings.kind, client_id=settings.client_id)
+        status.problem = line.problem or (self._lines[1].problem if len(self._lines) > 1 else None)
+        status.attempts, status.connections = line.attempts, line.connections
+        status.server = line.server
+        channel = line.channel
+        if channel is not None and channel.connection.granted is not None:
+            connection = channel.connection
+            status.connected = True
+            status.version = "5" if channel.version == V5 else "3.1.1"
+            status.since = round(self._loop.time() - channel.connected_at, 1)
+            status.round_trip = connection.round_trip
+            status.window = connection.room + connection.inflight
+            status.inflight = connection.inflight
+        status.waiting, status.waiting_bytes = counts.waiting, counts.bytes
+        if counts.oldest_at is not None:
+            status.oldest = round(max(0.0, self._journal_clock() - counts.oldest_at), 3)
+        status.offered, status.sent = counts.offered, counts.sent
+        status.offered_a_second, status.sent_a_second = self._rates.offered, self._rates.sent
+        status.received = self._in_counters.received
+        status.delivered = self._in_counters.delivered
+        status.refused = self._in_counters.refused
+        for (rule, reason), count in counts.dropped.items():
+            status.dropped.setdefault(rule, {})[reason.value] = count
+        for (rule, verdict), count in self._in_counters.dropped.items():
+            status.dropped.setdefault(rule, {})[verdict.value] = count
+        status.set_aside = counts.aside
+        status.refused_filters = [each for line in self._lines for each in line.refused_filters]
+        status.denied = dict(self._out.denied)
+        status.advice = bottleneck(status)
+        return status
+
+    def aside(self) -> list[dict[str, object]]:
+        """The messages that were set aside, the oldest first, with their age in seconds."""
+        now = self._journal_clock()
+        return [
+            {
+                "rule": each.rule,
+                "topic": each.topic,
+                "size": each.size,
+                "reason": each.reason,
+                "age": round(now - each.at, 1),
+            }
+            for each in self._backlog.aside()
+        ]
+
+    def clock_was_set(self) -> None:
+        """The wall clock was set: certificates may be valid now."""
+        for line in self._lines:
+            line.clock_was_set()
+
+    def _report(self) -> None:
+        """Publish the status here, where it has changed."""
+        session = self._out.answering
+        if session is None:
+            return
+        self._reported_at = self._loop.time()
+        status = self.status()
+        payload = orjson.dumps(status.as_json())
+        if payload != self._reported:
+            self._reported = payload
+            self.broker.publish(
+                Message(self.settings.status_here, payload, 0, True, _JSON), session
+            )
+            topic = f"$SYS/broker/connection/{self.settings.client_id}/state"
+            self.broker.publish(
+                Message(topic, b"1" if status.connected else b"0", 0, True), session
+            )
+            self.broker.flush()
+
+
+class _Line:
+    """Keeps one of the link's connections: dials, and dials again when it has ended."""
+
+    def __init__(self, link: Uplink, *, is_kept: bool) -> None:
+        self.is_kept = is_kept
+        self.channel: Channel | None = None
+        self.server = ""
+        self.problem: str | None = None
+        self.attempts = 0
+        self.connections = 0
+        self.refused_filters: list[str] = []
+        self._link = link
+        self._settings = link.settings
+        self._loop = link.entries.loop
+        self._version = link.settings.version
+        self._backoff = Backoff(len(link.settings.servers), random.random)
+        self._ending: asyncio.Future[Ending] | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._is_stopping = False
+        #: Set when the next dial is due before its time.
+        self._at_once = asyncio.Event()
+
+    def start(self) -> None:
+        """Begin to dial."""
+        if not self._is_stopping:
+            self._task = self._link.entries.task(
+                "upstream.dial", self._run(), served=self._link, failed=self._start_again
+            )
+
+    def _start_again(self) -> None:
+        """A fault has ended the task: go on a little later."""
+        self._link.entries.later("upstream.restart", AGAIN, self.start, failed=self._start_again)
+
+    async def stop(self) -> None:
+        """Disconnect, and dial no more."""
+        self._is_stopping = True
+        channel = self.channel
+        if channel is not None and channel.connection.granted is not None and not self.is_kept:
+            self._link._publish_state(channel, b"offline")
+        if channel is not None:
+            channel.close(ReasonCode.SUCCESS, "the appliance stops")
+        task = self._task
+        while task is not None and not task.done():
+            task.cancel()
+            await asyncio.wait({task}, timeout=CANCEL_TIMEOUT)
+
+    async def _run(self) -> None:
+        while True:
+            wait = await self._attempt()
+            self._at_once.clear()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._at_once.wait(), wait)
+
+    async def _attempt(self) -> float:
+        """One connection, from its dial to its end; returns the seconds until the next."""
+        link, settings = self._link, self._settings
+        server = settings.servers[self._backoff.server]
+        self.server = str(server)
+        self.attempts += 1
+        try:
+            login = settings.login
+            credentials = await in_thread(link.entries, partial(read_credentials, login))
+            tls = replace(
+                settings.tls,
+                alpn=tuple(
+                    alpn(settings.kind, server.port, settings.tls.alpn, login.username is not None)
+                ),
+            )
+            proxy = None if settings.proxy is None else parse_proxy(settings.proxy)
+            transport = await dial(server, tls, proxy, link.surroundings())
+        except (DialError, OSError, ValueError) as error:
+            return self._failed(str(error))
+        channel = Channel(
+            link,
+            link.connect_settings(self._version, credentials, is_kept=self.is_kept),
+            link.subscriptions(self._version, is_kept=self.is_kept),
+            link.least_late(is_kept=self.is_kept),
+            is_kept=self.is_kept,
+        )
+        self.channel = channel
+        self._ending = self._loop.create_future()
+        try:
+            channel.begin(transport)
+            ending = await self._until_end(credentials)
+        finally:
+            channel.close(ReasonCode.SUCCESS, "the appliance stops")
+            self.channel = None
+            transport.close("the appliance stops")
+        return self._after(ending)
+
+    async def _until_end(self, credentials: Credentials) -> Ending:
+        """Wait for the end; a login that expires is renewed before it does."""
+        ending = self._ending
+        assert ending is not None
+        channel = self.channel
+        assert channel is not None
+        while True:
+            renew_in = credentials.renew_in()
+            done, _ = await asyncio.wait({ending}, timeout=renew_in)
+            if done:
+                return ending.result()
+            credentials = await in_thread(
+                self._link.entries, partial(read_credentials, self._settings.login)
+            )
+            channel.renew_login(credentials.data)
+
+    def clock_was_set(self) -> None:
+        """Dial at once."""
+        self._backoff.clock_was_set()
+        self._at_once.set()
+
+    def on_opened(self, channel: Channel) -> None:
+        """CONNACK has come."""
+        self._backoff.connected(self._loop.time())
+        self.connections += 1
+        self.problem = None
+        log.info("%s: connected to %s as %s", self._link, self.server, quote(channel.client_id))
+
+    def on_ended(self, channel: Channel, ending: Ending) -> None:
+        """The connection has ended."""
+        self.channel = None
+        if self._ending is not None and not self._ending.done():
+            self._ending.set_result(ending)
+
+    def _after(self, ending: Ending) -> float:
+        now = self._loop.time()
+        if ending.refuses_version and self._version == V5:
+            return self._fall_back()
+        if ending.code == ReasonCode.SESSION_TAKEN_OVER and ending.by is EndedBy.BROKER:
+            wait = self._backoff.taken_over(now)
+            text = ending.text
+            if self._backoff.is_contested(now):
+                text = (
+                    f"another client has the client id {quote(self._settings.client_id)} as well, "
+                    f"and takes the connection over again and again (waiting {wait:.0f} s)"
+                )
+            return self._report_problem(text, wait)
+        if ending.by is EndedBy.US and ending.code == ReasonCode.SUCCESS:
+            return 0.0
+        return self._failed(ending.text)
+
+    def _fall_back(self) -> float:
+        """The broker does not know MQTT 5."""
+        overlapping = self._settings.overlapping()
+        if overlapping:
+            out, inward = overlapping[0]
+            return self._failed(
+                "the broker does not know MQTT 5, and with 3.1.1 the rules for "
+                f"{quote(out.local_filter)} and {quote(inward.remote_filter)} would send messages "
+                "in a circle"
+            )
+        self._version = V311
+        log.info("%s: %s does not know MQTT 5, going on with 3.1.1", self._link, self.server)
+        return 0.0
+
+    def _failed(self, problem: str) -> float:
+        return self._report_problem(problem, self._backoff.failed(self._loop.time()))
+
+    def _report_problem(self, problem: str, wait: float) -> float:
+        if problem != self.problem:
+            self.problem = problem
+            log.warning("%s: %s: %s", self._link, self.server, problem)
+        return wait
+
+
+def granted_limits(limits: FleetLimits, granted: Granted, version: int) -> FleetLimits:
+    """The limits of a kind of broker with those that it has granted."""
+    size = granted.maximum_packet_size
+    return replace(
+        limits,
+        window=granted.window,
+        qos=min(limits.qos, granted.maximum_qos),
+        retain=limits.retain and granted.retain,
+        packet_size=limits.packet_size if size is None else min(size, limits.packet_size),
+    )

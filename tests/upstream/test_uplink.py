@@ -1,0 +1,338 @@
+"""A link as a whole: the appliance in this process, and a fleet's broker that obeys the test."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+
+import pytest
+from waiting import until
+
+from appliance.mqtt.codec import V311, Property
+from appliance.mqtt.packets import (
+    Disconnect,
+    Puback,
+    Publish,
+    Suback,
+    Subscribe,
+    Subscription,
+)
+from appliance.mqtt.reason import ReasonCode
+from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
+from upstream.hostile import SCENARIOS
+from upstream.uplink_rig import Rig, hurry, running
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    hurry(monkeypatch)
+
+
+async def publish(rig: Rig, topic: str, *payloads: bytes, qos: int = 1, retain: bool = False):
+    """Publish them as a local client; they are acknowledged when this returns."""
+    peer = await rig.client("publisher")
+    for number, payload in enumerate(payloads, 1):
+        await peer.send(Publish(topic, payload, qos, retain, False, number if qos else None))
+    codes = [(await peer.receive()).reason_code for _ in payloads] if qos else []
+    peer.hang_up()
+    return codes
+
+
+def payloads(fleet: FakeFleet, topic: str) -> list[bytes]:
+    return [each.payload for each in fleet.published if each.topic == topic]
+
+
+async def test_what_is_acknowledged_here_arrives_there_once_and_in_order(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await fleet.visited()
+        sent = [b"%d" % number for number in range(300)]
+        assert await publish(rig, "r2d2/events/door", *sent) == [0] * 300
+        await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 300)
+        assert payloads(fleet, "fleet/r2d2/events/door") == sent
+        await rig.drained()
+        assert not fleet.faults
+
+
+async def test_what_waits_survives_restarts_of_both(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet:
+        await fleet.stop()
+        sent = [b"%d" % number for number in range(500)]
+        for part in (sent[:200], sent[200:]):
+            async with running(Rig(tmp_path, fleet.port)) as rig:
+                await publish(rig, "r2d2/events/door", *part)
+                assert rig.status().problem and not rig.status().connected
+        await fleet.start()
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 500)
+            await rig.drained()
+    assert payloads(fleet, "fleet/r2d2/events/door") == sent
+
+
+async def test_what_is_not_acknowledged_there_is_sent_again_on_the_next_connection(
+    tmp_path: Path,
+) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        fleet.acknowledge = never
+        visit = await fleet.visited()
+        await publish(rig, "r2d2/events/door", b"1", b"2", b"3")
+        await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 3)
+        fleet.acknowledge = accept
+        visit.reset()
+        await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 6)
+        assert payloads(fleet, "fleet/r2d2/events/door") == [b"1", b"2", b"3"] * 2
+        await rig.drained()
+
+
+async def test_of_a_state_the_latest_is_sent_after_an_outage_deletions_included(
+    tmp_path: Path,
+) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        visit = await fleet.visited()
+        await publish(rig, "r2d2/state/gone", b"there", retain=True)
+        await until(lambda: payloads(fleet, "fleet/r2d2/state/gone"))
+        await fleet.stop()
+        await until(lambda: not rig.status().connected)
+        await publish(rig, "r2d2/state/battery", *[b"%d" % n for n in range(100)], retain=True)
+        await publish(rig, "r2d2/state/gone", b"", retain=True)
+        await fleet.start()
+        await fleet.visited(2)
+        await until(lambda: payloads(fleet, "fleet/r2d2/state/battery"))
+        await rig.drained()
+        assert payloads(fleet, "fleet/r2d2/state/battery") == [b"99"]
+        assert payloads(fleet, "fleet/r2d2/state/gone") == [b"there", b""]
+        assert all(each.retain for each in fleet.published)
+        del visit
+
+
+async def test_online_and_offline_are_said_there_and_here(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet:
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await until(lambda: payloads(fleet, "fleet/r2d2/_appliance/state") == [b"online"])
+            will = fleet.connects[0].will
+            assert will is not None
+            assert (will.topic, will.payload, will.qos, will.retain) == (
+                "fleet/r2d2/_appliance/state",
+                b"offline",
+                1,
+                True,
+            )
+            retained = rig.app.broker.retained.get("r2d2/_appliance/upstream/fleet")
+            assert retained is not None and b'"connected":true' in retained.payload
+            state = rig.app.broker.retained.get("$SYS/broker/connection/r2d2/state")
+            assert state is not None and state.payload == b"1"
+        assert payloads(fleet, "fleet/r2d2/_appliance/state") == [b"online", b"offline"]
+        assert fleet.visit.disconnect is not None
+
+
+async def test_a_message_from_there_is_published_here_and_then_acknowledged(
+    tmp_path: Path,
+) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        visit = await fleet.visited()
+        peer = await rig.client("reader")
+        await peer.send(Subscribe(1, [Subscription("r2d2/cmd/#", 1)]))
+        assert isinstance(await peer.receive(), Suback)
+        packet_id = visit.message("fleet/r2d2/cmd/go", b"fast", 1)
+        got = await peer.receive()
+        assert (got.topic, got.payload, got.qos) == ("r2d2/cmd/go", b"fast", 1)
+        await peer.send(Puback(got.packet_id))
+        await until(lambda: (packet_id, 0) in visit.acknowledged, "PUBACK to the fleet")
+        peer.hang_up()
+
+
+async def test_a_request_from_there_is_answered_at_its_own_topic(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        visit = await fleet.visited()
+        peer = await rig.client("service")
+        await peer.send(Subscribe(1, [Subscription("r2d2/cmd/#", 1)]))
+        assert isinstance(await peer.receive(), Suback)
+        asked = {Property.RESPONSE_TOPIC: "answers/alice", Property.CORRELATION_DATA: b"7"}
+        visit.message("fleet/r2d2/cmd/call", b"?", 1, properties=asked)
+        got = await peer.receive()
+        topic = got.properties[Property.RESPONSE_TOPIC]
+        assert topic.startswith("r2d2/_upstream/fleet/")
+        answer = {Property.CORRELATION_DATA: got.properties[Property.CORRELATION_DATA]}
+        await peer.send(Publish(topic, b"!", 1, False, False, 5, answer))
+        await until(lambda: "answers/alice" in fleet.topics, "the answer")
+        packet = next(each for each in fleet.published if each.topic == "answers/alice")
+        assert packet.payload == b"!"
+        assert packet.properties[Property.CORRELATION_DATA] == b"7"
+        peer.hang_up()
+
+
+@pytest.mark.parametrize("code", [0x87, 0x90, 0x95, 0x99])
+async def test_what_the_fleet_never_takes_is_set_aside_and_blocks_nothing(
+    tmp_path: Path, code: int
+) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        fleet.acknowledge = refuse_topic("fleet/r2d2/events/bad", code)
+        await fleet.visited()
+        await publish(rig, "r2d2/events/bad", b"poison")
+        await publish(rig, "r2d2/events/good", b"1", b"2")
+        await rig.drained()
+        assert payloads(fleet, "fleet/r2d2/events/good")[-2:] == [b"1", b"2"]
+        assert rig.status().set_aside == 1
+        (aside,) = rig.uplink.aside()
+        assert aside["topic"] == "fleet/r2d2/events/bad"
+        why = ReasonCode(code).name.lower() if code != 0x95 else "0x95"  # PUBACK has no such code
+        assert why in str(aside["reason"]).lower()
+
+
+async def test_what_the_fleet_has_no_room_for_is_tried_again(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await until(lambda: payloads(fleet, "fleet/r2d2/_appliance/state"))
+        fleet.acknowledge = refuse(0x97, times=2)
+        await publish(rig, "r2d2/events/door", b"1")
+        await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == [b"1"] * 3)
+        await rig.drained()
+        assert rig.status().set_aside == 0
+
+
+async def test_the_fleet_that_closes_on_a_message_sent_alone_three_times_gets_it_no_more(
+    tmp_path: Path,
+) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        fleet.acknowledge = close_at("fleet/r2d2/events/bad")
+        await fleet.visited()
+        await publish(rig, "r2d2/events/first", b"1")
+        await publish(rig, "r2d2/events/bad", b"poison")
+        await publish(rig, "r2d2/events/last", b"2")
+        await rig.drained()
+        assert payloads(fleet, "fleet/r2d2/events/last")[-1:] == [b"2"]
+        assert [each["topic"] for each in rig.uplink.aside()] == ["fleet/r2d2/events/bad"]
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {Property.RECEIVE_MAXIMUM: 1},
+        {Property.MAXIMUM_QOS: 0},
+        {Property.MAXIMUM_QOS: 1, Property.RETAIN_AVAILABLE: 0},
+        {Property.SERVER_KEEP_ALIVE: 1},
+        {Property.MAXIMUM_PACKET_SIZE: 200},
+        {Property.WILDCARD_SUBSCRIPTION_AVAILABLE: 0},
+        {Property.SUBSCRIPTION_IDENTIFIER_AVAILABLE: 0},
+        {Property.TOPIC_ALIAS_MAXIMUM: 3},
+    ],
+    ids=str,
+)
+async def test_limits_of_connack_hold(tmp_path: Path, limits: dict[Property, object]) -> None:
+    async with FakeFleet(limits=limits) as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await until(lambda: rig.status().connected)
+        await publish(rig, "r2d2/events/door", *[b"%d" % n for n in range(20)], b"x" * 300)
+        await publish(rig, "r2d2/state/battery", b"1", retain=True)
+        await rig.drained()
+        assert not fleet.faults
+        assert payloads(fleet, "fleet/r2d2/events/door")[:20] == [b"%d" % n for n in range(20)]
+
+
+async def test_a_fleet_that_knows_3_1_1_alone_is_spoken_to_in_it(tmp_path: Path) -> None:
+    async with FakeFleet(versions=(V311,)) as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await rig.connected()
+        assert rig.status().version == "3.1.1"
+        await publish(rig, "r2d2/events/door", b"1")
+        await rig.drained()
+        assert payloads(fleet, "fleet/r2d2/events/door") == [b"1"]
+        assert [each.version for each in fleet.connects][-1] == V311
+        assert not fleet.faults
+
+
+async def test_rules_that_would_go_in_a_circle_are_not_carried_in_3_1_1(tmp_path: Path) -> None:
+    both = [{"topic": "cmd/#"}]
+    rig = Rig(tmp_path, 0, **{"in": both, "out": both})
+    async with FakeFleet(versions=(V311,)) as fleet:
+        rig = Rig(tmp_path, fleet.port, **{"in": both, "out": both})
+        async with running(rig):
+            await until(lambda: "circle" in (rig.status().problem or ""))
+            assert not rig.status().connected
+
+
+async def test_it_goes_on_when_the_client_id_is_taken_over(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        for count in range(1, 4):
+            visit = await fleet.visited(count)
+            visit.send(Disconnect(ReasonCode.SESSION_TAKEN_OVER))
+        await until(
+            lambda: "another client has the client id 'r2d2'" in (rig.status().problem or "")
+        )
+
+
+async def test_rules_with_offline_keep_have_a_session_that_the_fleet_keeps(tmp_path: Path) -> None:
+    rules = [{"topic": "cmd/#"}, {"topic": "mission/#", "offline": "keep"}]
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port, **{"in": rules})):
+        await fleet.visited(2)
+        by_id = {each.client_id: each for each in fleet.connects}
+        assert set(by_id) == {"r2d2", "r2d2-keep"}
+        assert by_id["r2d2"].clean_start and not by_id["r2d2-keep"].clean_start
+        assert by_id["r2d2-keep"].properties[Property.SESSION_EXPIRY_INTERVAL] > 0
+        assert by_id["r2d2-keep"].will is None
+        filters = {visit.connect.client_id: visit.filters for visit in fleet.visits}
+        assert "fleet/r2d2/mission/#" in filters["r2d2-keep"]
+        assert "fleet/r2d2/mission/#" not in filters["r2d2"]
+
+
+async def test_high_goes_before_what_waits(tmp_path: Path) -> None:
+    out = [{"topic": "events/#"}, {"topic": "alarms/#", "priority": "high"}]
+    async with FakeFleet() as fleet:
+        await fleet.stop()
+        async with running(Rig(tmp_path, fleet.port, out=out, window=10)) as rig:
+            await publish(rig, "r2d2/events/door", *[bytes(1000) for _ in range(500)])
+            await publish(rig, "r2d2/alarms/fire", b"fire")
+            await fleet.start()
+            await until(lambda: "fleet/r2d2/alarms/fire" in fleet.topics)
+            assert fleet.topics.index("fleet/r2d2/alarms/fire") < 20
+            await rig.drained()
+
+
+async def test_a_full_backlog_says_no_where_it_should(tmp_path: Path) -> None:
+    full = {"size": "1 MiB", "when_full": "refuse"}
+    async with FakeFleet() as fleet:
+        await fleet.stop()
+        async with running(Rig(tmp_path, fleet.port, backlog=full)) as rig:
+            codes = await publish(rig, "r2d2/events/door", *[bytes(50_000) for _ in range(50)])
+            taken = codes.count(0)
+            assert 15 < taken < 22 and codes[taken:] == [0x97] * (50 - taken)
+            await fleet.start()
+            await rig.drained()
+            assert len(payloads(fleet, "fleet/r2d2/events/door")) == taken
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, scenario in SCENARIOS.items() if not scenario.slow]
+)
+async def test_whatever_the_fleet_does_harms_nobody_else(tmp_path: Path, name: str) -> None:
+    scenario = SCENARIOS[name]
+    async with FakeFleet() as fleet:
+        scenario.prepare(fleet)
+        keep_alive = "1 s" if scenario.moment == "ping" else "30 s"
+        async with running(Rig(tmp_path, fleet.port, keep_alive=keep_alive)) as rig:
+            peer = await rig.client("local")
+            await peer.send(Subscribe(1, [Subscription("local", 1)]))
+            assert isinstance(await peer.receive(), Suback)
+
+            async def work() -> None:
+                for number in range(1, 65_000):
+                    await peer.send(Publish("local", b"x", 1, packet_id=number))
+                    for _ in range(2):
+                        got = await asyncio.wait_for(peer.receive(), 10)
+                        if isinstance(got, Publish):
+                            await peer.send(Puback(got.packet_id))
+                    await asyncio.sleep(0.05)
+
+            working = asyncio.ensure_future(work())
+            try:
+                await publish(rig, "r2d2/events/door", b"1", b"2", b"3")
+                await scenario.outcome(fleet)
+                fleet.acknowledge = accept  # some never do
+                assert not working.done(), working.exception()
+                assert not rig.app.broker.faults.count, rig.app.broker.faults.last
+            finally:
+                working.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await working
+                peer.hang_up()
+            if scenario.duty != "stays":
+                await rig.drained()
+                assert set(payloads(fleet, "fleet/r2d2/events/door")) == {b"1", b"2", b"3"}
+            assert not fleet.errors
