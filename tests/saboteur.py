@@ -28,6 +28,7 @@ PACKAGE = Path(__file__).parents[1] / "appliance"
 
 #: The calls whose first argument is an entry's name.
 NAMED = {
+    "_later",
     "_abandon",
     "_contained",
     "_report_fault",

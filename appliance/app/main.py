@@ -183,6 +183,9 @@ class App:
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", InsideLink())
         self._start_clock(loop)
+        # Before the listeners start, and stopped after them: whatever a client is acknowledged is
+        # offered to the links.
+        self._start_upstreams(store)
         if plugins is None:
             await listen()
             self._stack.push_async_callback(listeners.stop)
@@ -190,7 +193,6 @@ class App:
             await plugins.start()
             self._stack.push_async_callback(plugins.shutdown)
         self._start_bridge(loop)
-        self._start_upstreams(store)
         self._reload = Reload(
             ReloadParts(settings, access, tls, broker, listeners, self.bridge, self.audit)
         )

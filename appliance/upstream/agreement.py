@@ -109,7 +109,8 @@ class Ending:
 
     `code` is the reason code, UNSPECIFIED_ERROR where there is none. `refused` says that CONNACK
     had an error, `is_new` that the connection ended before CONNACK or by it: some brokers that do
-    not know a version say so (`refuses_version`), some only close the connection.
+    not know a version say so (`refuses_version`), some only close the connection. `is_silent` says
+    that nothing was heard any more, `is_violation` that the broker has violated the protocol.
     """
 
     by: EndedBy
@@ -118,6 +119,8 @@ class Ending:
     is_new: bool = False
     refused: bool = False
     server_reference: str | None = None
+    is_silent: bool = False
+    is_violation: bool = False
 
     @property
     def refuses_version(self) -> bool:

@@ -701,6 +701,9 @@ class Backlog:
         It is in flight until it is settled, set aside, tried again or rewound; what is sent with
         QoS 0 is to be settled at once.
         """
+        if self._messages == len(self._flying):
+            self._idle = True  # also while a rate is exceeded: the next message wakes the sender
+            return None
         only_again = False
         size = self._flying_size + self._again_size
         if size >= IN_FLIGHT_SIZE:

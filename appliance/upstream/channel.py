@@ -35,6 +35,10 @@ from appliance.upstream.transport import UpstreamTransport
 #: bring the next one nearer.
 CHECK_INTERVAL: Final = 1.0
 
+#: Bytes that are written and not sent from which on nothing more is read: answers to what was read,
+#: as of messages no more than a few packets are written at a time.
+MOST_UNSENT: Final = 1 << 20
+
 #: The shortest interval of PINGREQs for commands, in seconds, whatever `late` says.
 SHORTEST_PING: Final = 0.05
 
@@ -96,11 +100,12 @@ class Channel:
         self._transport: UpstreamTransport | None = None
         self._ping_interval = math.inf if late is None else max(late / 2, SHORTEST_PING)
         self._received_at = -math.inf
-        #: Bytes of the last write.
-        self._unsent = 0
+        #: Why nothing is read now; empty while it is.
+        self._holds: set[str] = set()
         self._timer: asyncio.TimerHandle | None = None
         self._ping_timer: asyncio.TimerHandle | None = None
         self._turn: asyncio.TimerHandle | None = None
+        self._turn_at = 0.0
         self._has_ended = False
 
     def __str__(self) -> str:
@@ -136,6 +141,8 @@ class Channel:
             if self._has_ended:
                 return False
         self._after(now)
+        if self._transport is not None and self._transport.unsent > MOST_UNSENT:
+            self._hold("unsent")  # it asks for answers that it does not read
         return False
 
     def proceed(self) -> bool:
@@ -144,6 +151,7 @@ class Channel:
 
     def writable(self) -> None:
         """See `TransportOwner`."""
+        self._release("unsent")
         self.send_on()
 
     def lost(self, reason: str) -> None:
@@ -162,7 +170,8 @@ class Channel:
         if self._has_ended:
             return
         if self.connection.settings.method is None:
-            self.close(ReasonCode.SUCCESS, "the token expires")
+            # With the will: the robot is offline until the next connection says otherwise.
+            self.close(ReasonCode.DISCONNECT_WITH_WILL_MESSAGE, "the token expires")
             return
         with contextlib.suppress(ValueError):  # one is under way
             self.connection.reauthenticate(data)
@@ -217,7 +226,6 @@ class Channel:
             return
         chunks = self.connection.take(now)
         if chunks:
-            self._unsent = sum(map(len, chunks))
             self._transport.write(chunks)
         if self.connection.ended is not None:
             self._finish()
@@ -228,11 +236,12 @@ class Channel:
 
     def _check_later(self, now: float) -> None:
         assert self._transport is not None
-        # What the system has taken is not distinguished from what the network has: it is little.
-        due = self.connection.tick(now, 0 if self._transport.writable else self._unsent)
+        due = self.connection.tick(now, self._transport.unsent)
         if self.connection.ended is not None:
             self._finish()
             return
+        if self.connection.waiting:  # a PINGREQ
+            self._transport.write(self.connection.take(now))
         if self._timer is None:
             self._timer = self._later("upstream.check", min(due, now + CHECK_INTERVAL), self._check)
 
@@ -281,6 +290,8 @@ class Channel:
             for timer in (self._timer, self._ping_timer, self._turn):
                 if timer is not None:
                     timer.cancel()
+            # Nothing else would free a cycle of references, see `app/main.py`.
+            self.inward = self._transport = None
             self._owner.ended(self, ending)
             self._broker.flush()
 
@@ -295,10 +306,11 @@ class Channel:
         """See `InConnection`."""
         when = self._loop.time() + seconds
         if self._turn is not None:
-            if self._turn.when() <= when:
+            if self._turn_at <= when:
                 return
             self._turn.cancel()
         self._turn = self._later("upstream.turn", when, self._take_turn)
+        self._turn_at = when
 
     def _take_turn(self) -> None:
         self._turn = None
@@ -312,13 +324,22 @@ class Channel:
 
     def pause_reading(self) -> None:
         """See `InConnection`."""
-        if self._transport is not None:
-            self._transport.pause_reading()
+        self._hold("receivers")
 
     def resume_reading(self) -> None:
         """See `InConnection`."""
-        if self._transport is not None:
-            self._transport.resume_reading()
+        self._release("receivers")
+
+    def _hold(self, why: str) -> None:
+        if self._transport is not None and not self._holds:
+            self._transport.pause_reading()
+        self._holds.add(why)
+
+    def _release(self, why: str) -> None:
+        if why in self._holds:
+            self._holds.discard(why)
+            if self._transport is not None and not self._holds:
+                self._transport.resume_reading()
 
     def close(self, code: ReasonCode, reason: str) -> None:
         """See `InConnection`."""

@@ -35,6 +35,10 @@ class Credentials:
         margin = min(MARGIN, (self.expires_at - self.read_at) / 10)
         return max(1.0, self.expires_at - margin - time.time())
 
+    def has_same_secret(self, other: Credentials) -> bool:
+        """Whether the files have not changed."""
+        return (self.password, self.data) == (other.password, other.data)
+
 
 def read_credentials(login: UpstreamLogin) -> Credentials:
     """Read the files of a login; not in the event loop.
@@ -78,4 +82,7 @@ def token_expiry(token: bytes) -> float | None:
     expiry = claims.get("exp") if isinstance(claims, dict) else None
     if isinstance(expiry, bool) or not isinstance(expiry, int | float):
         return None
-    return float(expiry)
+    try:
+        return float(expiry)
+    except OverflowError:
+        return None

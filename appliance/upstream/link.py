@@ -778,12 +778,14 @@ class FleetConnection(Generic[T]):
 
     def _fail(self, code: ReasonCode, text: str) -> None:
         """The broker has violated the protocol (5.0 section 4.13)."""
-        self._end(Ending(EndedBy.US, code, text, self.granted is None), notify=True)
+        ending = Ending(EndedBy.US, code, text, self.granted is None, is_violation=True)
+        self._end(ending, notify=True)
 
     def _give_up(self, text: str) -> None:
         """The broker does not answer. No DISCONNECT: nobody reads it, and the will is due."""
         code = ReasonCode.UNSPECIFIED_ERROR
-        self._end(Ending(EndedBy.NETWORK, code, text, self.granted is None), notify=False)
+        ending = Ending(EndedBy.NETWORK, code, text, self.granted is None, is_silent=True)
+        self._end(ending, notify=False)
 
     def _end(self, ending: Ending, *, notify: bool) -> None:
         if self.ended is not None:

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 SENT_PER_TURN: Final = 256
 
 #: Bytes of a PUBLISH beside its topic, properties and payload, at most.
-HEADER_SIZE: Final = 16
+HEADER_SIZE: Final = 9
 
 #: Reason codes with which the broker says that it will never take a message.
 POISON: Final = frozenset(
@@ -45,6 +45,20 @@ POISON: Final = frozenset(
         ReasonCode.PAYLOAD_FORMAT_INVALID,
     )
 )
+
+#: Reason codes of DISCONNECT that may be about a message.
+CLOSES_ON_MESSAGE: Final = POISON | {
+    ReasonCode.UNSPECIFIED_ERROR,
+    ReasonCode.MALFORMED_PACKET,
+    ReasonCode.PROTOCOL_ERROR,
+    ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
+    ReasonCode.RECEIVE_MAXIMUM_EXCEEDED,
+    ReasonCode.RETAIN_NOT_SUPPORTED,
+    ReasonCode.QOS_NOT_SUPPORTED,
+}
+
+#: Messages beside the suspects after which the rest of these is forgotten.
+PATIENCE: Final = 1000
 
 #: A message is set aside when the broker has closed the connection so often on it, sent alone.
 #: Messages are sent alone after so many connections that ended without any progress.
@@ -72,11 +86,14 @@ class Sender:
         #: that was so.
         self._stuck_on = -1
         self._stuck = 0
-        #: Messages that are still to be sent one at a time; and the one that was sent alone when
-        #: the broker closed the connection, and how often it did.
-        self._careful = 0
+        #: The numbers of messages on one of which the broker may have closed: they are sent one at
+        #: a time. And the one that was sent alone when it closed, and how often it did.
+        self._suspects: set[int] = set()
         self._closed_on = -1
         self._closed = 0
+        #: Messages to be acknowledged until the rest of the suspects, which were dropped, is
+        #: forgotten.
+        self._patience = 0
 
     def begin(self, limits: FleetLimits) -> None:
         """A connection is up, with these limits."""
@@ -87,7 +104,7 @@ class Sender:
         """Hand messages to the connection; True if there may be more for another turn."""
         now = self._clock()
         for _ in range(SENT_PER_TURN):
-            if not connection.room or (self._careful and connection.inflight):
+            if not connection.room or (self._suspects and connection.inflight):
                 return False
             if connection.waiting >= WRITE_PORTION:
                 return True
@@ -122,10 +139,10 @@ class Sender:
 
     def acknowledged(self, entries: Sequence[Entry | None], code: int, reason: str) -> None:
         """Messages were acknowledged, or refused with a code of 0x80 or above."""
-        self._stuck = 0
         for entry in entries:
             if entry is None:
                 continue
+            self._clear(entry)
             if code < 0x80:
                 self._backlog.settle(entry)
             elif code in POISON:
@@ -133,34 +150,49 @@ class Sender:
                 self._set_aside(entry, f"{text}, {quote(reason)}" if reason else text)
             else:
                 self._backlog.retry_later(entry, self._clock())
-            if self._careful:
-                self._careful -= 1
 
-    def end(self, ending: Ending, inflight: Sequence[Entry | None]) -> None:
-        """The connection has ended with these messages in flight: they are sent again."""
+    def _clear(self, entry: Entry) -> None:
+        """The broker has answered: it does not close the connection on this message."""
+        if not self._suspects:
+            return
+        self._suspects.discard(entry.record.number)
+        self._patience -= 1
+        if self._patience <= 0:
+            self._suspects.clear()
+
+    def end(self, ending: Ending, inflight: Sequence[Entry | None], *, was_settled: bool) -> None:
+        """The connection has ended with these messages in flight: they are sent again.
+
+        It `was_settled` if the broker had answered all else that it was sent at the beginning.
+        """
+        numbers = [entry.record.number for entry in inflight if entry is not None]
         first = next((entry for entry in inflight if entry is not None), None)
-        if first is not None and _may_be_poison(ending):
-            self._suspect(first, len(inflight), ending)
+        if first is not None and was_settled and _may_be_poison(ending):
+            self._suspect(first, numbers, ending)
         self._backlog.rewind()
 
-    def _suspect(self, first: Entry, suspects: int, ending: Ending) -> None:
+    def _suspect(self, first: Entry, numbers: list[int], ending: Ending) -> None:
         """The broker has closed the connection: perhaps because of one of the messages."""
-        number = first.record.number
-        if self._careful:
+        number = numbers[0]
+        if self._suspects:
+            if number not in self._suspects:
+                return
             self._closed = self._closed + 1 if self._closed_on == number else 1
             self._closed_on = number
             if self._closed >= CLOSED_ON:
+                self._suspects.discard(number)
+                self._closed = 0
                 self._set_aside(
                     first,
-                    f"the fleet's broker has closed the connection {self._closed} times when it "
-                    f"was sent this message alone; the last time: {ending.text}",
+                    f"the connection has ended {CLOSED_ON} times when the fleet's broker was sent "
+                    f"this message alone; the last time: {ending.text}",
                 )
-                self._careful = self._closed = 0
             return
         self._stuck = self._stuck + 1 if self._stuck_on == number else 1
         self._stuck_on = number
         if self._stuck >= WITHOUT_PROGRESS:
-            self._careful = suspects
+            self._suspects = set(numbers)
+            self._patience = len(numbers) + PATIENCE
 
     def _set_aside(self, entry: Entry, reason: str) -> None:
         log.warning(
@@ -173,11 +205,12 @@ class Sender:
 
 
 def _may_be_poison(ending: Ending) -> bool:
-    """Whether the connection may have ended because of what the broker was sent: it has closed it,
-    it has answered nonsense, or we could not go on."""
+    """Whether the connection may have ended because of a message that the broker was sent."""
+    if ending.is_silent:
+        return False
     if ending.by is EndedBy.US:
-        return ending.code >= 0x80
-    return ending.code != ReasonCode.SERVER_SHUTTING_DOWN
+        return ending.is_violation  # it has answered nonsense
+    return ending.by is EndedBy.NETWORK or ending.code in CLOSES_ON_MESSAGE
 
 
 def _properties(entry: Entry, now: float) -> bytes:

@@ -17,7 +17,8 @@ class LinkStatus:
 
     `problem` is why it is not connected, or what is wrong although it is. `waiting` messages are
     not acknowledged by the fleet's broker yet; the oldest is `oldest` seconds old. `dropped` is by
-    rule and reason, both ways.
+    rule and reason, both ways. Of what came, `held_back` messages wait for their receivers here,
+    and `unacknowledged` ones are not acknowledged to the fleet's broker.
     """
 
     name: str
@@ -43,6 +44,8 @@ class LinkStatus:
     received: int = 0
     delivered: int = 0
     refused: int = 0
+    unacknowledged: int = 0
+    held_back: int = 0
     dropped: dict[str, dict[str, int]] = field(default_factory=dict)
     set_aside: int = 0
     refused_filters: list[str] = field(default_factory=list)

@@ -286,6 +286,13 @@ class UpstreamTransport:
             )
         return False
 
+    @property
+    def unsent(self) -> int:
+        """Bytes that were written and never sent: here, and in the system."""
+        if self._transport is None:
+            return 0
+        return self._transport.get_write_buffer_size() + self._unsent()
+
     def _unsent(self) -> int:
         """Bytes in the system that were never sent; 0 where it does not tell."""
         assert self._transport is not None

@@ -52,11 +52,19 @@ REPORT_INTERVAL: Final = 10.0
 #: Seconds for which the fleet's broker is asked to keep the session of rules with `offline: keep`.
 KEPT_EXPIRY: Final = 7 * 86400
 
+#: The least seconds between two renewals of the login, or looks for a newer token.
+RENEWAL_INTERVAL: Final = 60.0
+
 #: Seconds after a fault of the appliance until what has failed is tried again.
 AGAIN: Final = 1.0
 
 #: Seconds that the stop waits for a dial to be cancelled, at a time.
 CANCEL_TIMEOUT: Final = 2.0
+
+#: What CONNECT announces. Explicitly, because mosquitto otherwise has no more than 20 messages in
+#: flight; and so large, because mosquitto exceeds a smaller one when a session is resumed. What is
+#: read at once is bounded by `InSession`, which pauses reading.
+RECEIVE_MAXIMUM: Final = 65_534
 
 _JSON: Final[Properties] = {Property.CONTENT_TYPE: "application/json"}
 
@@ -110,8 +118,13 @@ class Uplink:
         if any(rule.offline == "keep" for rule in settings.inward):
             self._lines.append(_Line(self, is_kept=True))
         self._rates = Rates()
+        #: On the present connection: whether the state is still to be published there, and whether
+        #: the broker has answered that.
+        self._state_due = False
+        self._is_settled = False
         self._clock: PeriodicCallback | None = None
         self._send_timer: asyncio.TimerHandle | None = None
+        self._send_at = 0.0
         self._offer_timer: asyncio.Handle | None = None
         self._reported: bytes = b""
         self._reported_at = 0.0
@@ -176,9 +189,10 @@ class Uplink:
     def _send_later(self, seconds: float) -> None:
         when = self._loop.time() + seconds
         if self._send_timer is not None:
-            if self._send_timer.when() <= when:
+            if self._send_at <= when:
                 return
             self._send_timer.cancel()
+        self._send_at = when
         self._send_timer = self.entries.at(
             "upstream.send", when, self._send, failed=self._send_again
         )
@@ -198,6 +212,11 @@ class Uplink:
         """See `ChannelOwner`."""
         if channel is not self._lines[0].channel or not channel.can_send:
             return
+        if self._state_due and channel.connection.room:
+            self._state_due = False
+            self._publish_state(channel, b"online")
+        if not self._is_settled:
+            return  # so that an end of the connection is not taken for that of a message
         if self._sender.send(channel.connection):
             self._send_later(0.0)
             return
@@ -207,6 +226,15 @@ class Uplink:
 
     def acknowledged(self, entries: list[Entry | None], code: int, reason: str) -> None:
         """See `ChannelOwner`."""
+        if None in entries:  # the state
+            self._is_settled = True
+            if code >= 0x80:
+                log.warning(
+                    "%s: the fleet's broker refuses %s: %s",
+                    self,
+                    quote(self.settings.state_there),
+                    reason_name(code),
+                )
         self._sender.acknowledged(entries, code, reason)
 
     # --- the connections -----------------------------------------------------------------------
@@ -232,6 +260,7 @@ class Uplink:
         line.on_opened(channel)
         if line.is_kept:
             return
+        self._state_due = self._is_settled = False
         granted = channel.connection.granted
         assert granted is not None
         self._out.version = channel.version
@@ -249,7 +278,7 @@ class Uplink:
                 reason_name(code),
             )
         if not line.is_kept:
-            self._publish_state(channel, b"online")
+            self._state_due = True  # as soon as the window has room
         self._report()
 
     def ended(self, channel: Channel, ending: Ending) -> None:
@@ -257,7 +286,8 @@ class Uplink:
         line = self._line_of(channel)
         try:
             if not line.is_kept:
-                self._sender.end(ending, channel.connection.unsettled())
+                inflight = channel.connection.unsettled()
+                self._sender.end(ending, inflight, was_settled=self._is_settled)
         finally:
             line.on_ended(channel, ending)
         self._report()
@@ -272,9 +302,12 @@ class Uplink:
         if granted is None:
             return
         limits = KINDS[self.settings.kind]
-        qos = min(1, granted.maximum_qos)
+        # With QoS 0 where the window has no room: before the end, nothing else will follow.
+        qos = min(1, granted.maximum_qos, connection.room)
         retain = granted.retain and limits.retain
         connection.publish(None, self.settings.state_there, state, qos, retain)
+        if not qos:
+            self._is_settled = True
 
     def connect_settings(
         self, version: int, credentials: Credentials, *, is_kept: bool
@@ -297,6 +330,7 @@ class Uplink:
             method=settings.login.method if version == V5 and limits.auth else None,
             authentication_data=credentials.data if version == V5 else None,
             window=min(settings.window, limits.window),
+            receive_maximum=RECEIVE_MAXIMUM,
             maximum_packet_size=self.broker.limits.packet_size,
             user_properties=self.broker.limits.user_properties,
             filters_per_packet=limits.filters or 100,
@@ -366,6 +400,9 @@ class Uplink:
         status.received = self._in_counters.received
         status.delivered = self._in_counters.delivered
         status.refused = self._in_counters.refused
+        for channel in filter(None, (line.channel for line in self._lines)):
+            status.unacknowledged += channel.connection.unacknowledged
+            status.held_back += channel.inward.waiting if channel.inward is not None else 0
         for (rule, reason), count in counts.dropped.items():
             status.dropped.setdefault(rule, {})[reason.value] = count
         for (rule, verdict), count in self._in_counters.dropped.items():
@@ -485,7 +522,7 @@ class _Line:
             )
             proxy = None if settings.proxy is None else parse_proxy(settings.proxy)
             transport = await dial(server, tls, proxy, link.surroundings())
-        except (DialError, OSError, ValueError) as error:
+        except (DialError, OSError, RuntimeError, ValueError) as error:
             return self._failed(str(error))
         channel = Channel(
             link,
@@ -500,7 +537,12 @@ class _Line:
             channel.begin(transport)
             ending = await self._until_end(credentials)
         finally:
-            channel.close(ReasonCode.SUCCESS, "the appliance stops")
+            code = (
+                ReasonCode.SUCCESS
+                if self._is_stopping
+                else (ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR)
+            )
+            channel.close(code, "the appliance stops")
             self.channel = None
             transport.close("the appliance stops")
         return self._after(ending)
@@ -511,15 +553,25 @@ class _Line:
         assert ending is not None
         channel = self.channel
         assert channel is not None
+        look_in = credentials.renew_in()
         while True:
-            renew_in = credentials.renew_in()
-            done, _ = await asyncio.wait({ending}, timeout=renew_in)
+            done, _ = await asyncio.wait({ending}, timeout=look_in)
             if done:
                 return ending.result()
-            credentials = await in_thread(
-                self._link.entries, partial(read_credentials, self._settings.login)
-            )
-            channel.renew_login(credentials.data)
+            look_in = RENEWAL_INTERVAL
+            try:
+                newer = await in_thread(
+                    self._link.entries, partial(read_credentials, self._settings.login)
+                )
+            except (OSError, ValueError, RuntimeError) as error:
+                self._report_problem(str(error), 0.0)
+                continue
+            if newer.has_same_secret(credentials):
+                self._report_problem("the token expires, and its file has no newer one", 0.0)
+                continue
+            credentials = newer
+            look_in = max(RENEWAL_INTERVAL, newer.renew_in() or 0.0)
+            channel.renew_login(newer.data)
 
     def clock_was_set(self) -> None:
         """Dial at once."""
@@ -552,7 +604,7 @@ class _Line:
                     f"and takes the connection over again and again (waiting {wait:.0f} s)"
                 )
             return self._report_problem(text, wait)
-        if ending.by is EndedBy.US and ending.code == ReasonCode.SUCCESS:
+        if ending.by is EndedBy.US and ending.code < 0x80:
             return 0.0
         return self._failed(ending.text)
 

@@ -135,7 +135,7 @@ class Visit:
     def reset(self) -> None:
         """RST."""
         sock = self.writer.get_extra_info("socket")
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, AttributeError, ValueError):  # uvloop's, closed
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RST)
         abort(self.writer.transport)
 

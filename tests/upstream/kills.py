@@ -24,6 +24,9 @@ MOST_WAITING = 5000
 #: Seconds without anything new after which nothing more is expected.
 QUIET = 2.0
 
+#: Seconds between two lines that say what is missing.
+PROGRESS = 10.0
+
 #: Seconds without anything new after which what is missing is lost: two backoffs of a minute.
 STALLED = 130.0
 
@@ -273,9 +276,13 @@ class Kills:
             source.stopping = True
         await self._until(lambda: all(s.idle for s, _, _ in self.sources), "exchanges end")
         count, since = -1, time.monotonic()
+        told_at = since
         while True:
             await asyncio.sleep(0.05)
             now = time.monotonic()
+            if now - told_at > PROGRESS:
+                told_at = now
+                self.say(f"still missing: {self._shortages()}")
             if self.there_sink.count + self.here_sink.count != count:
                 count, since = self.there_sink.count + self.here_sink.count, now
             elif now - since > QUIET and (not self._missing() or now - since > STALLED):
@@ -284,6 +291,18 @@ class Kills:
     def _missing(self) -> bool:
         return any(
             self._owed(source) - set(sink.numbers(topic)) for source, sink, topic in self.sources
+        )
+
+    def _shortages(self) -> str:
+        """By topic, how many acknowledged messages have not arrived."""
+        missing = {
+            topic: sorted(self._owed(source) - set(sink.numbers(topic)))
+            for source, sink, topic in self.sources
+        }
+        return ", ".join(
+            f"{topic}: {len(numbers)} from {numbers[0]} to {numbers[-1]}"
+            for topic, numbers in missing.items()
+            if numbers
         )
 
     def _owed(self, source: Source) -> set[int]:

@@ -22,6 +22,9 @@ from appliance.mqtt.reason import ReasonCode
 from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
 from upstream.uplink_rig import Rig, hurry, running
+from upstream.uplink_rig import event_loop_policy as event_loop_policy
+
+pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 
 @pytest.fixture(autouse=True)

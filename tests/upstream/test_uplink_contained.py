@@ -13,6 +13,9 @@ from appliance.mqtt.packets import Publish
 from appliance.upstream import channel, uplink
 from upstream.fake_fleet import FakeFleet
 from upstream.uplink_rig import Rig, hurry, running
+from upstream.uplink_rig import event_loop_policy as event_loop_policy
+
+pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 
 async def publish(rig: Rig, payload: bytes) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import uvloop
 import yaml
 from harness import Peer
 from waiting import until
@@ -22,6 +23,12 @@ from appliance.upstream.status import LinkStatus
 from appliance.upstream.uplink import Uplink
 
 ACL = "topic readwrite #\ntopic read $SYS/#\nuser upstream\ntopic readwrite {robot}/#\n"
+
+
+@pytest.fixture(scope="session")
+def event_loop_policy() -> asyncio.AbstractEventLoopPolicy:
+    """The event loop that the appliance runs on."""
+    return uvloop.EventLoopPolicy()
 
 
 class Rig:
