@@ -69,6 +69,8 @@ class Member:
             keep_alive=10,
         )
         self.client = client = await asyncio.wait_for(dial, ANSWER)
+        for _, message in client.messages:  # those that came right behind CONNACK
+            self.took(message)
         client.on_message = self.took
         self.connects += 1
         await self.began(client)
