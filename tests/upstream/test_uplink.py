@@ -76,8 +76,9 @@ async def test_what_is_not_acknowledged_there_is_sent_again_on_the_next_connecti
     tmp_path: Path,
 ) -> None:
     async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
-        fleet.acknowledge = never
         visit = await fleet.visited()
+        await until(lambda: payloads(fleet, "fleet/r2d2/_appliance/state"))
+        fleet.acknowledge = never
         await publish(rig, "r2d2/events/door", b"1", b"2", b"3")
         await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 3)
         fleet.acknowledge = accept
