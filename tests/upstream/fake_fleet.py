@@ -411,7 +411,7 @@ def reversed_in(count: int) -> Answer:
 
 
 def close_at(*topics: str, times: int | None = None) -> Answer:
-    """The connection ends without an answer at a message with these topics, as at a poisonous one."""
+    """The connection ends at a message with one of the topics, unanswered: it is poisonous."""
     left = itertools.count() if times is None else iter(range(times))
 
     def answer(visit: Visit, packet: Publish) -> None:
