@@ -10,13 +10,27 @@ def bridge_cells() -> list[str]:
     return [cell.name for cell in CELLS if isinstance(cell, RosCell)]
 
 
-def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
+def upstream_cells() -> list[str]:
+    """The names of the cells that measure a link to a fleet's broker."""
+    from appliance.bench.links import LINKS
+
+    return [cell.name for cell in LINKS]
+
+
+def main(
+    cells: list[str] | None,
+    seconds: float,
+    peer: str | None,
+    as_json: bool,
+    messages: int | None = None,
+) -> int:
     """Measure and print; returns the exit status, 0 when every cell ran.
 
-    `cells` are names of CELLS (None: all), `seconds` is the length of one run, and `peer` the
-    mosquitto to compare with (None: the one that is installed). Unmet goals are no failure.
+    `cells` are names of CELLS (None: all but those of links), `seconds` is the length of one run,
+    and `peer` the mosquitto to compare with (None: the one that is installed). `messages` wait for
+    a link in its cells. Unmet goals are no failure.
     """
     # Imported here, as the processes of the load import this package too and need none of it.
     from appliance.bench import command
 
-    return command.main(cells, seconds, peer, as_json)
+    return command.main(cells, seconds, peer, as_json, messages)

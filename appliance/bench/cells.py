@@ -54,13 +54,25 @@ class Row:
             ours, peer = peer, ours
         return peer / ours if ours and peer is not None else None
 
+    def meets(self, figure: str) -> bool | None:
+        """Whether a figure meets its goals; None when it has none, or one is missing."""
+        cell, value, ratio = self.cell, getattr(self.ours, figure, None), self.ratio(figure)
+        goal, least, most = (each.get(figure) for each in (cell.goals, cell.at_least, cell.at_most))
+        verdicts = [
+            None if value is None else value >= least if least is not None else True,
+            None if value is None else value <= most if most is not None else True,
+            True if goal is None else None if ratio is None else ratio >= goal,
+        ]
+        if goal is least is most is None or None in verdicts:
+            return None
+        return all(verdicts)
+
     @property
     def met(self) -> bool | None:
         """Whether every goal is met; None when a figure is missing."""
-        ratios = [(self.ratio(figure), goal) for figure, goal in self.cell.goals.items()]
-        if any(ratio is None for ratio, _ in ratios):
-            return None
-        return all(ratio is not None and ratio >= goal for ratio, goal in ratios)
+        cell = self.cell
+        verdicts = [self.meets(each) for each in (*cell.goals, *cell.at_least, *cell.at_most)]
+        return None if None in verdicts else all(verdicts)
 
 
 class Side(Protocol):
@@ -76,11 +88,17 @@ class Side(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One row of the report. `goals` are minimum ratios of mosquitto's figures to ours."""
+    """One row of the report.
+
+    `goals` are minimum ratios of mosquitto's figures to ours, `at_least` and `at_most` are goals of
+    our own figures.
+    """
 
     name: str
     title: str
     goals: Mapping[str, float] = field(default_factory=dict)
+    at_least: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    at_most: Mapping[str, float] = field(default_factory=dict, kw_only=True)
 
     def missing(self) -> str | None:
         """What this computer lacks to run the cell."""

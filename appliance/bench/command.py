@@ -11,6 +11,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from dataclasses import replace
 from types import FrameType
 
 from rich.console import Console
@@ -19,21 +20,31 @@ from rich.markup import escape
 from appliance.bench import report
 from appliance.bench.cells import CELLS, REPEATS, Cell, Row, compare
 from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, grow
+from appliance.bench.links import LEAST_MESSAGES, LINKS, LinkCell
 from appliance.bench.peers import find_mosquitto, mosquitto_version
 
 INTERRUPTED = 130  # the exit status that shells use for SIGINT
 
 
-def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: bool) -> int:
+def main(
+    cells: list[str] | None,
+    seconds: float,
+    peer: str | None,
+    as_json: bool,
+    messages: int | None = None,
+) -> int:
     """See `appliance.bench.main`."""
     console = Console(stderr=True)
-    every: tuple[Cell | GrowthCell, ...] = (*CELLS, *GROWTH)
+    every: tuple[Cell | GrowthCell, ...] = (*CELLS, *LINKS, *GROWTH)
     known = {cell.name: cell for cell in every}
     if unknown := [name for name in cells or () if name not in known]:
         console.print(f"no such cell: {', '.join(unknown)}; there are {', '.join(known)}")
         return 2
     if seconds <= 0:
         console.print("the seconds to measure must be more than 0")
+        return 2
+    if messages is not None and messages < LEAST_MESSAGES:
+        console.print(f"at least {LEAST_MESSAGES} messages have to wait for a link")
         return 2
     command = find_mosquitto(peer)
     if command is None and peer is not None:
@@ -43,7 +54,11 @@ def main(cells: list[str] | None, seconds: float, peer: str | None, as_json: boo
         console.print(
             "mosquitto is not installed (apt install mosquitto): measuring the appliance alone"
         )
-    chosen = [known[name] for name in cells or known]
+    # Those of links only where they are asked for: they take minutes.
+    chosen = [known[name] for name in cells or known if cells or known[name] not in LINKS]
+    for place, each in enumerate(chosen):
+        if isinstance(each, LinkCell):
+            chosen[place] = replace(each, fleet=command, messages=messages or each.messages)
     rows: list[Row] = []
     grown: list[GrowthRow] = []
     status = 0

@@ -52,7 +52,6 @@ LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or doe
     "retained_bytes": "1 GiB",
     "memory": "1 GiB",
 }
-QUEUES = f"max_inflight_messages {INFLIGHT}\nmax_queued_messages 0"  # of mosquitto
 EXTRA_PATHS = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
 START_SECONDS = 60.0
 STOP_SECONDS = 10.0
@@ -128,11 +127,19 @@ def mosquitto_version(command: str) -> str:
 
 
 @contextlib.contextmanager
-def mosquitto(command: str, site: Site, *, default_limits: bool = False) -> Iterator[Server]:
+def mosquitto(
+    command: str,
+    site: Site,
+    *,
+    default_limits: bool = False,
+    window: int = INFLIGHT,
+    bridge: str = "",
+) -> Iterator[Server]:
     """Run mosquitto with its default queue and window or larger ones, and stop it in the end.
 
-    Raises PeerError.
+    `bridge` is added to its configuration. Raises PeerError.
     """
+    queues = f"max_inflight_messages {window}\nmax_queued_messages 0"
     directory = Path(tempfile.mkdtemp(prefix="mosquitto-", dir=site.directory))
     (directory / "acl").write_text(ACL)
     salt = secrets.token_bytes(12)
@@ -153,11 +160,12 @@ persistence false
 log_dest stderr
 log_type error
 log_type warning
-{"" if default_limits else QUEUES}
+{"" if default_limits else queues}
 listener {port} 127.0.0.1
 listener {tls_port} 127.0.0.1
 certfile {site.directory / "server.crt"}
 keyfile {site.directory / "server.key"}
+{bridge}
 """
     )
     argv = [command, "-c", str(directory / "mosquitto.conf")]
@@ -175,16 +183,21 @@ def appliance(
     durability: str = "off",
     *,
     default_limits: bool = False,
+    upstreams: Sequence[Mapping[str, object]] = (),
 ) -> Iterator[Server]:
     """Run this appliance, with a bridge when there are routes, and stop it in the end.
 
-    Its limits are raised, unless it is to have the default ones. Raises PeerError.
+    Its limits are raised, unless it is to have the default ones. Links log in at the fleet's broker
+    with the password file `fleet.password`. Raises PeerError.
     """
     directory = Path(tempfile.mkdtemp(prefix="appliance-", dir=site.directory))
     passwords = Passwords(directory / "users.passwd")
     passwords.set(USER, site.password)
     passwords.save()
     (directory / "acl.conf").write_text(ACL)
+    login = directory / "fleet.password"
+    login.write_text(site.password)
+    login.chmod(0o600)
     port, tls_port = free_ports(2)
     settings = {
         "robot": "bench",
@@ -205,6 +218,7 @@ def appliance(
             "store": {"durability": durability},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
+        "upstreams": [dict(each) for each in upstreams],
         "log": {"level": "warning", "levels": {"appliance.store": "info"}},
     }
     file = directory / "appliance.yaml"

@@ -53,7 +53,13 @@ def watch(client: LoadClient) -> None:
             continue
         if not sys.stdin.readline():
             return
-        print_answer({"longest": percentile(samples, 1.0), "median": percentile(samples, 0.5)})
+        print_answer(
+            {
+                "longest": percentile(samples, 1.0),
+                "p99": percentile(samples, 0.99),
+                "median": percentile(samples, 0.5),
+            }
+        )
         samples.clear()
 
 

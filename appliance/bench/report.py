@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from appliance.bench.cells import Row
+from appliance.bench.cells import Cell, Row
 from appliance.bench.growth import Figures, GrowthRow, Statement
 from appliance.bench.peers import LIMITS
 
@@ -57,6 +57,8 @@ def to_json(
                     "peer": asdict(row.peer) if row.peer else None,
                     "ratios": {figure: row.ratio(figure) for figure in HEADINGS},
                     "goals": dict(row.cell.goals),
+                    "at_least": dict(row.cell.at_least),
+                    "at_most": dict(row.cell.at_most),
                     "met": row.met,
                     "note": row.note,
                     "problem": row.problem,
@@ -117,12 +119,11 @@ def table(rows: Sequence[Row], peer: str | None) -> Table:
             ours, theirs = (getattr(each, figure, None) for each in (row.ours, row.peer))
             if ours is None and theirs is None:
                 continue
-            goal = row.cell.goals.get(figure)
             ratio = row.ratio(figure)
             cells = [title, heading, number(ours)]
             if peer:
                 cells += [number(theirs), f"{ratio:.2f}" if ratio is not None else ""]
-                cells += [f"≥ {goal:g}" if goal else "", verdict(ratio, goal)]
+                cells += [goals(row.cell, figure), verdict(row.meets(figure))]
             result.add_row(*cells)
             title = ""
         for name, figures in (("appliance", row.ours), (peer or "", row.peer)):
@@ -181,11 +182,25 @@ def reached(verdict: bool | None) -> str:
     return "[green]reached[/green]" if verdict else "[red]not reached[/red]"
 
 
-def verdict(ratio: float | None, goal: float | None) -> str:
-    """Whether a goal is met, in words."""
-    if ratio is None or goal is None:
+def goals(cell: Cell, figure: str) -> str:
+    """The goals of a figure: of the ratio, and of ours."""
+    texts = [
+        f"{sign} {text}"
+        for sign, text in (
+            ("≥", f"{cell.goals.get(figure, 0):.3g}"),
+            ("appliance ≥", number(cell.at_least.get(figure))),
+            ("appliance ≤", number(cell.at_most.get(figure))),
+        )
+        if text not in ("", "0")
+    ]
+    return ", ".join(texts)
+
+
+def verdict(met: bool | None) -> str:
+    """Whether a figure meets its goals, in words."""
+    if met is None:
         return ""
-    return "[green]met[/green]" if ratio >= goal else "[red]not met[/red]"
+    return "[green]met[/green]" if met else "[red]not met[/red]"
 
 
 def show(rows: Sequence[Row], grown: Sequence[GrowthRow], peer: str | None) -> None:

@@ -159,7 +159,13 @@ def bench(
         list[str] | None, typer.Option(metavar="NAME", help="Only this cell. Repeatable.")
     ] = None,
     bridge: Annotated[bool, typer.Option("--bridge", help="Only the cells of the bridge.")] = False,
+    upstream: Annotated[
+        bool, typer.Option("--upstream", help="Only the cells of a link to a fleet's broker.")
+    ] = False,
     seconds: Annotated[float, typer.Option(help="Seconds that each cell is measured.")] = 3.0,
+    messages: Annotated[
+        int | None, typer.Option(help="Messages that wait for a link.", show_default="100,000")
+    ] = None,
     peer: Annotated[
         str | None, typer.Option(metavar="PATH", help="The mosquitto executable to compare with.")
     ] = None,
@@ -168,4 +174,5 @@ def bench(
     from appliance import bench
 
     cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
-    raise typer.Exit(bench.main(cells or None, seconds, peer, as_json))
+    cells += bench.upstream_cells() if upstream else ()
+    raise typer.Exit(bench.main(cells or None, seconds, peer, as_json, messages))

@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from appliance import bench
-from appliance.bench import cells, client, command, conversion, ends, growth, load, report
+from appliance.bench import cells, client, command, conversion, drain, ends, growth, load, report
 from appliance.bench.cells import (
     CELLS,
     BridgeCell,
@@ -35,6 +35,7 @@ from appliance.bench.cells import (
 from appliance.bench.client import LoadError, LoadTarget
 from appliance.bench.crowd import Crowd
 from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, Statement, grow
+from appliance.bench.links import LINKS
 from appliance.bench.load import Load, LoadPublisher, LoadSubscriber, MessageFlow, Result
 from appliance.bench.peers import PeerError, Server, Site, find_mosquitto
 from appliance.mqtt.topics import check_filter, matches
@@ -97,6 +98,23 @@ def test_every_bridge_gives_sane_figures_on_both_sides(
         assert figures.rate is not None and figures.rate < 2000
 
 
+@needs_mosquitto
+def test_a_link_gives_sane_figures_on_both_devices() -> None:
+    cell = dataclasses.replace(LINKS[1], messages=2500, round_trip=0.02, fleet=MOSQUITTO)
+    row = compare(cell, MOSQUITTO, 0.3, repeats=1)
+    assert row.problem is None and row.missing is None
+    for figures in (row.ours, row.peer):
+        check_sane(dataclasses.replace(figures, rate=figures.messages / figures.seconds))
+        assert figures.messages == 2500
+        assert figures.beside_us is not None and figures.beside_us < 30_000_000
+    assert row.ours is not None and row.ours.p50_us > 10_000, "half a round trip at least"
+    assert row.met is not None
+
+
+def test_a_link_needs_a_broker_of_a_fleet() -> None:
+    assert compare(LINKS[0], None, 0.3).missing == "needs mosquitto as the fleet's broker"
+
+
 def test_conversion_gives_sane_figures_and_both_give_the_same_json() -> None:
     pytest.importorskip("rclpy")
     (cell,) = (cell for cell in CELLS if isinstance(cell, ConversionCell))
@@ -150,6 +168,21 @@ def test_ratios_and_goals() -> None:
     assert Row(cell, ours).met is None
 
 
+def test_goals_of_our_own_figures() -> None:
+    cell = Cell("c", "a cell", {"rate": 1.0}, at_least={"rate": 9.0}, at_most={"p99_us": 5.0})
+    ours = Result("c", False, 1.0, rate=9.0, p99_us=5.0)
+    peer = dataclasses.replace(ours, rate=8.0)
+    assert Row(cell, ours, peer).met is True
+    assert Row(cell, ours).met is None
+    assert Row(cell, ours, dataclasses.replace(peer, rate=9.1)).meets("rate") is False
+    assert Row(cell, dataclasses.replace(ours, rate=8.9), peer).meets("rate") is False
+    assert Row(cell, dataclasses.replace(ours, p99_us=5.1), peer).meets("p99_us") is False
+    assert Row(cell, dataclasses.replace(ours, p99_us=None), peer).met is None
+    assert Row(cell, ours, peer).meets("p50_us") is None
+    assert report.goals(cell, "rate") == "≥ 1, appliance ≥ 9.0"
+    assert report.goals(cell, "p99_us") == "appliance ≤ 5.0"
+
+
 def test_what_is_reached_is_at_most_the_goal() -> None:
     statements = (Statement("a", "a", "ms", 50.0), Statement("b", "b"), Statement("c", "c", "", 0))
     cell = GrowthCell("g", "a cell", 7, statements)
@@ -195,6 +228,13 @@ def test_growth_in_json_for_machines(
     told = {each["figure"]: each for each in row["statements"]}
     assert told["failed"]["at_most"] == row["ours"]["failed"] == row["peer"]["failed"] == 0
     assert told["failed"]["reached"] is told["failed"]["reached_by_peer"] is True
+
+
+@needs_mosquitto
+def test_so_many_messages_wait_as_are_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(["upstream"], 1.0, None, True, 1999) == 2
+    assert "at least 2000 messages" in capsys.readouterr().err
+    assert bench.upstream_cells() == ["upstream", "upstream-100ms"]
 
 
 def test_without_a_peer_ours_alone(
@@ -285,6 +325,47 @@ def test_the_table_says_what_was_not_reached(capsys: pytest.CaptureFixture[str])
     assert "· a loss 0 0 reached" in words
     assert "mosquitto: gone" in words
     assert "publish_rate" in " ".join(words)
+
+
+# Links
+
+
+def test_what_is_sent_through_the_relay_comes_late_complete_and_then_its_end() -> None:
+    command = [sys.executable, "-m", "appliance.bench.delay", "--round-trip", "0.2", "--to"]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(20)
+        process = subprocess.Popen(
+            [*command, str(listener.getsockname()[1])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        with process:
+            assert process.stdout is not None
+            port = json.loads(process.stdout.readline())["port"]
+            began = time.monotonic()
+            with socket.create_connection(("127.0.0.1", port), 20) as near:
+                sent = os.urandom(300_000)
+                near.sendall(sent)
+                near.shutdown(socket.SHUT_WR)
+                far, _ = listener.accept()
+                with far:
+                    far.settimeout(20)
+                    received = far.recv(1)
+                    took = time.monotonic() - began
+                    while data := far.recv(1 << 16):
+                        received += data
+    assert received == sent
+    assert took >= 0.1
+    assert process.returncode == 0
+
+
+def test_a_message_that_a_link_has_sent_twice_counts_once() -> None:
+    events = drain.Events()
+    events.expect(10, 3)
+    events.arrived([b"00000009", b"00000010", b"00000011", b"00000010", b"00000013"])
+    assert events.count == 2
+    events.arrived([b"00000012"])
+    assert events.count == 3
 
 
 # The load generator
