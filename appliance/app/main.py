@@ -14,6 +14,7 @@ from dataclasses import asdict
 from datetime import timedelta
 from functools import partial
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
 import psutil
 import uvloop
@@ -53,8 +54,9 @@ from appliance.ros.ros1.node import Ros1Node
 from appliance.ros.ros2 import discovery
 from appliance.ros.ros2.node import Ros2Node
 from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
-from appliance.upstream import settings as upstream_settings
-from appliance.upstream.uplink import Uplink, UplinkParts
+
+if TYPE_CHECKING:
+    from appliance.upstream.uplink import Uplink
 
 log = logging.getLogger(__name__)
 
@@ -311,6 +313,11 @@ class App:
 
     def _start_upstreams(self, store: SessionStore) -> None:
         """Connect to the fleets' brokers in the background."""
+        if not self.settings.upstreams:
+            return  # what is imported here takes a tenth of a second
+        from appliance.upstream import settings as upstream_settings
+        from appliance.upstream.uplink import Uplink, UplinkParts
+
         parts = UplinkParts(self.broker, self._entries, store.backlogs, self._listeners.scheduler)
         for settings in upstream_settings.upstreams(self.settings):
             uplink = Uplink(settings, parts)

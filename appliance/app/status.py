@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import psutil
 
@@ -18,16 +18,18 @@ from appliance import certs
 from appliance.app.reload import Reload
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
+from appliance.broker.meter import Meter
 from appliance.certs.settings import tls_files
 from appliance.config import Settings, about_size
 from appliance.host.clock import RELEASED, is_unset
 from appliance.net.listeners import Listeners
 from appliance.ros.bridge import Bridge
-from appliance.ros.metrics import Meter
 from appliance.ros.status import RouteStatus
 from appliance.store import SessionStore
 from appliance.upstream.status import warnings_of as upstream_warnings
-from appliance.upstream.uplink import Uplink
+
+if TYPE_CHECKING:
+    from appliance.upstream.uplink import Uplink
 
 #: The part of a limit from which on its use is reported, with the users that hold most of it.
 NEARLY_FULL = 0.8

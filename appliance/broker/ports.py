@@ -229,6 +229,26 @@ class InsideLink:
         """
 
 
+class ReceivingLink(InsideLink):
+    """Calls `receive` with each message, whether it is a retained one, and the identifiers of the
+    subscriptions that it matches."""
+
+    def __init__(self, receive: Callable[[Message, bool, list[int] | None], None]) -> None:
+        self._receive = receive
+
+    def publish(
+        self,
+        message: Message,
+        qos: int,
+        packet_id: int,
+        dup: bool,
+        retain: bool,
+        subscription_ids: list[int] | None,
+    ) -> None:
+        """Take a message."""
+        self._receive(message, retain, subscription_ids)
+
+
 class Store(Protocol):
     """Persistence of sessions and retained messages across restarts.
 

@@ -23,6 +23,7 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import ReceivingLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
@@ -31,7 +32,6 @@ from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics, DiagnosticsTopic
 from appliance.ros.graph_follower import FlowKey, GraphFollower, TopicRoutes
-from appliance.ros.link import ReceivingLink
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import deque
 from dataclasses import dataclass, field, fields, replace
 from itertools import accumulate
 from time import monotonic
@@ -13,9 +12,6 @@ BOUNDS = (
     *(0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05),
     *(0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
 )
-
-#: A rate is the mean over so many seconds.
-RATE_WINDOW = 5.0
 
 
 class Latency:
@@ -115,28 +111,3 @@ class FlowCounters(ReceiveCounters):
                 setattr(self, item.name, total)
         self.last_error = other.last_error or self.last_error
         self.latency.add(other.latency)
-
-
-class Meter:
-    """Messages and bytes per second, as the mean over RATE_WINDOW."""
-
-    __slots__ = ("_points",)
-
-    def __init__(self) -> None:
-        self._points: deque[tuple[float, int, int]] = deque()
-
-    def tick(self, now: float, messages: int, size: int) -> None:
-        """Record the counters; called about once a second."""
-        points = self._points
-        points.append((now, messages, size))
-        while len(points) > 2 and points[1][0] <= now - RATE_WINDOW:
-            points.popleft()
-
-    @property
-    def rates(self) -> tuple[float, float]:
-        """Messages per second, and bytes per second."""
-        if len(self._points) < 2:
-            return 0.0, 0.0
-        (then, messages, size), (now, more, larger) = self._points[0], self._points[-1]
-        seconds = now - then
-        return (more - messages) / seconds, (larger - size) / seconds

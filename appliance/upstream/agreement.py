@@ -74,7 +74,7 @@ class Granted:
 
     `window` is the lesser of ours and the Receive Maximum. `maximum_packet_size` is in bytes,
     None for no limit. `keep_alive` and `session_expiry` are in seconds. `wildcards`, `identifiers`
-    and `shared` say which kinds of subscription there are.
+    and `shared` say which kinds of subscription there are. `properties` are those of the packet.
     """
 
     session_present: bool
@@ -90,6 +90,7 @@ class Granted:
     wildcards: bool
     identifiers: bool
     shared: bool
+    properties: Properties = field(default_factory=dict, repr=False)
     reason: str = ""
     server_reference: str | None = None
     authentication_data: bytes | None = field(default=None, repr=False)
@@ -153,6 +154,7 @@ def granted_by(settings: ConnectSettings, packet: Connack) -> Granted:
         wildcards=bool(number(Property.WILDCARD_SUBSCRIPTION_AVAILABLE, 1)),
         identifiers=is_v5 and bool(number(Property.SUBSCRIPTION_IDENTIFIER_AVAILABLE, 1)),
         shared=is_v5 and bool(number(Property.SHARED_SUBSCRIPTION_AVAILABLE, 1)),
+        properties=properties,
         reason=reason_string(properties),
         server_reference=cast("str | None", properties.get(Property.SERVER_REFERENCE)),
         authentication_data=cast("bytes | None", properties.get(Property.AUTHENTICATION_DATA)),

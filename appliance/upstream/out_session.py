@@ -18,7 +18,7 @@ from typing import Protocol
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Identity, InsideLink, PublishRejection
+from appliance.broker.ports import Action, Identity, PublishRejection, ReceivingLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import V5, Properties, Property, encode_properties, encode_string
 from appliance.mqtt.packets import Subscription
@@ -117,7 +117,7 @@ class OutSession:
             self._identity.client_id, _OutLink(self), self._identity
         )
         self._answering = self._broker.attach(
-            answers_client_id(self._settings.name), _AnswerLink(self)
+            answers_client_id(self._settings.name), ReceivingLink(self.take_answer)
         )
         wanted = Subscription(self._rules.answers.local_filter, 0, retain_handling=2)
         self._broker.subscribe(self._answering, wanted)
@@ -184,7 +184,7 @@ class OutSession:
 
     # --- messages ------------------------------------------------------------------------------
 
-    def take(self, message: Message, subscription_ids: list[int] | None) -> None:
+    def take(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
         """Offer a message that one of the filters matches."""
         publisher = message.publisher
         if publisher is not None and publisher.client_id in self._own:
@@ -202,7 +202,9 @@ class OutSession:
         if not is_found_again:
             self._offer(rule, topic, message)
 
-    def take_answer(self, message: Message) -> None:
+    def take_answer(
+        self, message: Message, retain: bool, subscription_ids: list[int] | None
+    ) -> None:
         """Offer an answer to a request from there."""
         publisher = message.publisher
         if publisher is not None and publisher.client_id in self._own:
@@ -293,23 +295,12 @@ class OutSession:
             return False
 
 
-class _OutLink(InsideLink):
+class _OutLink(ReceivingLink):
     """The link of the session that subscribes to the filters of the rules."""
 
     def __init__(self, owner: OutSession) -> None:
+        super().__init__(owner.take)
         self._owner = owner
-
-    def publish(
-        self,
-        message: Message,
-        qos: int,
-        packet_id: int,
-        dup: bool,
-        retain: bool,
-        subscription_ids: list[int] | None,
-    ) -> None:
-        """Take a message."""
-        self._owner.take(message, subscription_ids)
 
     def later(self) -> None:
         """There are more retained messages than one turn may offer."""
@@ -318,22 +309,3 @@ class _OutLink(InsideLink):
     def rules_changed(self) -> None:
         """Ask anew what may be subscribed to."""
         self._owner.rules_changed()
-
-
-class _AnswerLink(InsideLink):
-    """The link of the session for answers."""
-
-    def __init__(self, owner: OutSession) -> None:
-        self._owner = owner
-
-    def publish(
-        self,
-        message: Message,
-        qos: int,
-        packet_id: int,
-        dup: bool,
-        retain: bool,
-        subscription_ids: list[int] | None,
-    ) -> None:
-        """Take an answer."""
-        self._owner.take_answer(message)

@@ -86,11 +86,9 @@ class Sender:
         #: that was so.
         self._stuck_on = -1
         self._stuck = 0
-        #: The numbers of messages on one of which the broker may have closed: they are sent one at
-        #: a time. And the one that was sent alone when it closed, and how often it did.
-        self._suspects: set[int] = set()
-        self._closed_on = -1
-        self._closed = 0
+        #: The numbers of messages on one of which the broker may have closed, with how often it has
+        #: when the message was sent alone. While there are any, one message is sent at a time.
+        self._suspects: dict[int, int] = {}
         #: Messages to be acknowledged until the rest of the suspects, which were dropped, is
         #: forgotten.
         self._patience = 0
@@ -124,7 +122,7 @@ class Sender:
         record = entry.record
         is_v5 = connection.settings.version == V5
         properties = _properties(entry, now) if is_v5 else NO_PROPERTIES
-        size = HEADER_SIZE + len(record.topic) + len(properties) + len(record.payload)
+        size = HEADER_SIZE + len(record.topic.encode()) + len(properties) + len(record.payload)
         why = self._limits.unsendable(record.topic, size)
         if why:
             self._set_aside(entry, f"the fleet's broker does not take it: {why}")
@@ -155,7 +153,7 @@ class Sender:
         """The broker has answered: it does not close the connection on this message."""
         if not self._suspects:
             return
-        self._suspects.discard(entry.record.number)
+        self._suspects.pop(entry.record.number, None)
         self._patience -= 1
         if self._patience <= 0:
             self._suspects.clear()
@@ -175,13 +173,9 @@ class Sender:
         """The broker has closed the connection: perhaps because of one of the messages."""
         number = numbers[0]
         if self._suspects:
-            if number not in self._suspects:
-                return
-            self._closed = self._closed + 1 if self._closed_on == number else 1
-            self._closed_on = number
-            if self._closed >= CLOSED_ON:
-                self._suspects.discard(number)
-                self._closed = 0
+            closed = self._suspects[number] = self._suspects.get(number, 0) + 1
+            if closed >= CLOSED_ON:
+                del self._suspects[number]
                 self._set_aside(
                     first,
                     f"the connection has ended {CLOSED_ON} times when the fleet's broker was sent "
@@ -191,7 +185,7 @@ class Sender:
         self._stuck = self._stuck + 1 if self._stuck_on == number else 1
         self._stuck_on = number
         if self._stuck >= WITHOUT_PROGRESS:
-            self._suspects = set(numbers)
+            self._suspects = dict.fromkeys(numbers, 0)
             self._patience = len(numbers) + PATIENCE
 
     def _set_aside(self, entry: Entry, reason: str) -> None:

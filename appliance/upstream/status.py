@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final
-
-#: Seconds over which rates are measured.
-SECONDS: Final = 10
+from typing import Any
 
 
 @dataclass(slots=True)
@@ -82,20 +78,3 @@ def bottleneck(status: LinkStatus) -> str | None:
         f"Receive Maximum {status.window} at {status.round_trip * 1000:.0f} ms allows "
         f"{allowed:.0f} a second; {status.offered_a_second:.0f} come"
     )
-
-
-class Rates:
-    """Messages a second of what was offered and sent, over the last seconds."""
-
-    def __init__(self) -> None:
-        self.offered = 0.0
-        self.sent = 0.0
-        self._seen: deque[tuple[float, int, int]] = deque(maxlen=SECONDS)
-
-    def tick(self, now: float, offered: int, sent: int) -> None:
-        """Take the counters as they are now; about once a second."""
-        self._seen.append((now, offered, sent))
-        at, first_offered, first_sent = self._seen[0]
-        if now > at:
-            self.offered = round((offered - first_offered) / (now - at), 1)
-            self.sent = round((sent - first_sent) / (now - at), 1)

@@ -19,6 +19,7 @@ import orjson
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.meter import Meter
 from appliance.broker.ports import Backlogs
 from appliance.config.urls import parse_proxy
 from appliance.mqtt.codec import V5, V311, Properties, Property, quote, reason_name
@@ -26,7 +27,7 @@ from appliance.mqtt.packets import Subscription, Will
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.net.layers import LayerScheduler
-from appliance.upstream.agreement import ConnectSettings, EndedBy, Ending, Granted
+from appliance.upstream.agreement import ConnectSettings, EndedBy, Ending
 from appliance.upstream.answers import Answers, reply_filter
 from appliance.upstream.backlog import Backlog
 from appliance.upstream.backoff import Backoff
@@ -35,12 +36,12 @@ from appliance.upstream.credentials import Credentials, read_credentials
 from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
 from appliance.upstream.in_session import InCounters, InSession
-from appliance.upstream.limits import KINDS, FleetLimits, alpn
+from appliance.upstream.limits import KINDS, alpn
 from appliance.upstream.out_session import OutSession
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import LinkRules, UpstreamSettings
 from appliance.upstream.sender import Sender
-from appliance.upstream.status import LinkStatus, Rates, bottleneck
+from appliance.upstream.status import LinkStatus, bottleneck
 from appliance.upstream.transport import Surroundings
 
 log = logging.getLogger(__name__)
@@ -117,7 +118,7 @@ class Uplink:
         self._lines = [_Line(self, is_kept=False)]
         if any(rule.offline == "keep" for rule in settings.inward):
             self._lines.append(_Line(self, is_kept=True))
-        self._rates = Rates()
+        self._offered, self._sent = Meter(), Meter()
         #: On the present connection: whether the state is still to be published there, and whether
         #: the broker has answered that.
         self._state_due = False
@@ -159,8 +160,10 @@ class Uplink:
     def _tick(self) -> None:
         self._backlog.tick(self._journal_clock())
         counts = self._backlog.counts()
-        self._rates.tick(self._loop.time(), counts.offered, counts.sent)
-        if self._loop.time() >= self._reported_at + REPORT_INTERVAL:
+        now = self._loop.time()
+        self._offered.tick(now, counts.offered)
+        self._sent.tick(now, counts.sent)
+        if now >= self._reported_at + REPORT_INTERVAL:
             self._report()
 
     # --- out -----------------------------------------------------------------------------------
@@ -264,7 +267,8 @@ class Uplink:
         granted = channel.connection.granted
         assert granted is not None
         self._out.version = channel.version
-        self._sender.begin(granted_limits(KINDS[self.settings.kind], granted, channel.version))
+        limits = KINDS[self.settings.kind]
+        self._sender.begin(limits.announced(granted.properties, channel.version))
 
     def subscribed(self, channel: Channel, refused: list[tuple[Subscription, int]]) -> None:
         """See `ChannelOwner`."""
@@ -365,7 +369,7 @@ class Uplink:
     def surroundings(self) -> Surroundings:
         """For the transport."""
         broker = self.broker
-        account = broker.accounting.accounts.inside
+        account = broker.accounting.accounts.of_user(self.settings.user)
         return Surroundings(
             self._scheduler,
             account,
@@ -396,7 +400,8 @@ class Uplink:
         if counts.oldest_at is not None:
             status.oldest = round(max(0.0, self._journal_clock() - counts.oldest_at), 3)
         status.offered, status.sent = counts.offered, counts.sent
-        status.offered_a_second, status.sent_a_second = self._rates.offered, self._rates.sent
+        status.offered_a_second = round(self._offered.rates[0], 1)
+        status.sent_a_second = round(self._sent.rates[0], 1)
         status.received = self._in_counters.received
         status.delivered = self._in_counters.delivered
         status.refused = self._in_counters.refused
@@ -630,15 +635,3 @@ class _Line:
             self.problem = problem
             log.warning("%s: %s: %s", self._link, self.server, problem)
         return wait
-
-
-def granted_limits(limits: FleetLimits, granted: Granted, version: int) -> FleetLimits:
-    """The limits of a kind of broker with those that it has granted."""
-    size = granted.maximum_packet_size
-    return replace(
-        limits,
-        window=granted.window,
-        qos=min(limits.qos, granted.maximum_qos),
-        retain=limits.retain and granted.retain,
-        packet_size=limits.packet_size if size is None else min(size, limits.packet_size),
-    )

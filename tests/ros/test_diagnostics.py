@@ -8,8 +8,9 @@ import logging
 import pytest
 
 from appliance.broker.broker import Broker
+from appliance.broker.meter import Meter
 from appliance.ros.bridge import Bridge
-from appliance.ros.metrics import BOUNDS, FlowCounters, Latency, Meter
+from appliance.ros.metrics import BOUNDS, FlowCounters, Latency
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules
 

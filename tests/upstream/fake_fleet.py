@@ -410,12 +410,12 @@ def reversed_in(count: int) -> Answer:
     return answer
 
 
-def close_at(topic: str, times: int | None = None) -> Answer:
-    """The connection ends without an answer at a message with that topic, as at a poisonous one."""
+def close_at(*topics: str, times: int | None = None) -> Answer:
+    """The connection ends at a message with one of the topics, unanswered: it is poisonous."""
     left = itertools.count() if times is None else iter(range(times))
 
     def answer(visit: Visit, packet: Publish) -> None:
-        if packet.topic == topic and next(left, None) is not None:
+        if packet.topic in topics and next(left, None) is not None:
             visit.close()
         else:
             accept(visit, packet)

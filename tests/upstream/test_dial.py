@@ -733,8 +733,8 @@ async def test_little_is_unsent_while_the_broker_does_not_read(site, tmp_path, s
         assert unsent + here <= 64 * 1024 + 1024, (unsent, here)
         assert unsent <= SYSTEM_UNSENT + WRITE_PORTION + 1024
         reads.set()
-        await until(lambda: transport.writable)
-        assert owner.writables
+        await until(lambda: owner.writables, "the call that says so")
+        assert transport.writable
         transport.abort()
 
 

@@ -19,6 +19,7 @@ from appliance.mqtt.packets import (
     Subscription,
 )
 from appliance.mqtt.reason import ReasonCode
+from appliance.upstream.sender import WITHOUT_PROGRESS
 from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
 from upstream.uplink_rig import Rig, hurry, running
@@ -205,6 +206,24 @@ async def test_the_fleet_that_closes_on_a_message_sent_alone_three_times_gets_it
         await rig.drained()
         assert payloads(fleet, "fleet/r2d2/events/last")[-1:] == [b"2"]
         assert [each["topic"] for each in rig.uplink.aside()] == ["fleet/r2d2/events/bad"]
+
+
+async def test_a_poisonous_message_that_overtakes_another_one_blocks_nothing_either(
+    tmp_path: Path,
+) -> None:
+    """It comes while the first is sent again, alone."""
+    rules = [{"topic": "alarms/#", "priority": "high"}, {"topic": "events/#"}]
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port, out=rules)) as rig:
+        bad = "fleet/r2d2/events/bad", "fleet/r2d2/alarms/bad"
+        fleet.acknowledge = close_at(*bad)
+        await fleet.visited()
+        await publish(rig, "r2d2/events/bad", b"poison")
+        await until(lambda: fleet.topics.count(bad[0]) == WITHOUT_PROGRESS + 1, "it sent alone")
+        await publish(rig, "r2d2/alarms/bad", b"poison")
+        await publish(rig, "r2d2/alarms/good", b"1")
+        await rig.drained()
+        assert payloads(fleet, "fleet/r2d2/alarms/good") == [b"1"]
+        assert {each["topic"] for each in rig.uplink.aside()} == set(bad)
 
 
 @pytest.mark.parametrize(

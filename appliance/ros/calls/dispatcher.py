@@ -34,13 +34,13 @@ from typing import Literal, TypeAlias, TypeVar
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
+from appliance.broker.ports import ReceivingLink
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.replay_guard import ReplayGuard
-from appliance.ros.link import ReceivingLink
 from appliance.ros.payload.converter import TooLargeError
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import (

@@ -11,7 +11,8 @@ import logging
 import threading
 from time import monotonic
 
-from appliance.ros.metrics import FlowCounters, Meter
+from appliance.broker.meter import Meter
+from appliance.ros.metrics import FlowCounters
 from appliance.ros.skipped import Skipped
 from appliance.ros.topics.follower import TopicFollower
 from appliance.ros.topics.route import BridgedTopic, Direction, LogFunction
