@@ -60,9 +60,9 @@ _LEGAL: dict[State, frozenset[PacketType]] = {
 
 # What the first byte is when the peer does not speak MQTT at all, and what the user can do.
 _STRANGERS = {
-    0x15: "what it sends is TLS; is it meant for mqtts: or wss:?",
-    0x16: "what it sends is TLS; is it meant for mqtts: or wss:?",
-    0x48: "what it sends is HTTP; is it meant for ws: or wss:?",  # the H of HTTP/1.1
+    0x15: "what it sends is TLS: is the port one for mqtts:// or wss://?",
+    0x16: "what it sends is TLS: is the port one for mqtts:// or wss://?",
+    0x48: "what it sends is HTTP: is the port one for ws://?",  # the H of HTTP/1.1
 }
 
 # First byte of an acknowledgement -> its event without the packet id, and its reason codes.

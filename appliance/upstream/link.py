@@ -31,7 +31,6 @@ from appliance.mqtt.codec import (
     encode_varint,
     malformed,
     quote,
-    reason_name,
 )
 from appliance.mqtt.framing import PUBACK, PUBREC, PUBREL, RawPublish
 from appliance.mqtt.packets import (
@@ -75,6 +74,7 @@ from appliance.upstream.link_events import (
     Unsubscribed,
 )
 from appliance.upstream.receipts import Receipts
+from appliance.upstream.refusals import reason_words
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -558,7 +558,7 @@ class FleetConnection(Generic[T]):
 
     def _refused(self, what: str, code: int, properties: Properties, *, refused: bool) -> None:
         """The broker has ended the connection with a reason."""
-        text = f"the broker {what}: {reason_name(code)}"
+        text = f"the broker {what}: {reason_words(code, self._version)}"
         reason = reason_string(properties)
         if reason:
             text += f", {quote(reason)}"

@@ -119,7 +119,7 @@ def tls_refusal(error: BaseException, server: ServerUrl, tls: UpstreamTls) -> st
     detail = getattr(error, "reason", None) or str(error) or type(error).__name__
     text = str(detail).replace("_", " ").lower()
     name = expected_name(server, tls)
-    plain = "ws" if server.websocket else "mqtt"
+    plain = "ws:// or mqtt" if server.websocket else "mqtt:// or ws"
     if any(
         part in text
         for part in ("wrong version", "http request", "packet length", "unknown protocol")
@@ -138,7 +138,10 @@ def tls_refusal(error: BaseException, server: ServerUrl, tls: UpstreamTls) -> st
     if alert or "handshake failure" in text:
         return f"the broker does not accept the certificate {tls.certificate} ({text})"
     if isinstance(error, ConnectionError) or "eof" in text:
-        return f"the broker closed the connection during the TLS handshake ({text})"
+        return (
+            f"the broker closed the connection during the TLS handshake; is the port one for "
+            f"{plain}://? ({text})"
+        )
     return f"TLS: {text}"
 
 

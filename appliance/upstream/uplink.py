@@ -21,8 +21,8 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.meter import Meter
 from appliance.broker.ports import Backlogs
-from appliance.config.urls import parse_proxy
-from appliance.mqtt.codec import V5, V311, Properties, Property, quote, reason_name
+from appliance.config.urls import ServerUrl, parse_proxy
+from appliance.mqtt.codec import V5, V311, Properties, Property, quote
 from appliance.mqtt.packets import Subscription, Will
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, PeriodicCallback
@@ -38,6 +38,12 @@ from appliance.upstream.dial_error import DialError
 from appliance.upstream.in_session import InCounters, InSession
 from appliance.upstream.limits import KINDS, alpn
 from appliance.upstream.out_session import OutSession
+from appliance.upstream.refusals import (
+    ending_advice,
+    reason_words,
+    state_advice,
+    subscription_advice,
+)
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import LinkRules, UpstreamSettings
 from appliance.upstream.sender import Sender
@@ -233,10 +239,11 @@ class Uplink:
             self._is_settled = True
             if code >= 0x80:
                 log.warning(
-                    "%s: the fleet's broker refuses %s: %s",
+                    "%s: the fleet's broker refuses %s: %s; %s",
                     self,
                     quote(self.settings.state_there),
-                    reason_name(code),
+                    reason_words(code),
+                    state_advice(code, self.settings),
                 )
         self._sender.acknowledged(entries, code, reason)
 
@@ -276,10 +283,11 @@ class Uplink:
         line.refused_filters = [each.filter for each, _ in refused]
         for each, code in refused:
             log.warning(
-                "%s: the fleet's broker refuses the subscription to %s: %s",
+                "%s: the fleet's broker refuses the subscription to %s: %s; %s",
                 self,
                 quote(each.filter),
-                reason_name(code),
+                reason_words(code),
+                subscription_advice(code, self.settings, each.filter),
             )
         if not line.is_kept:
             self._state_due = True  # as soon as the window has room
@@ -384,7 +392,10 @@ class Uplink:
         settings, line = self.settings, self._lines[0]
         counts = self._backlog.counts()
         status = LinkStatus(settings.name, settings.kind, client_id=settings.client_id)
-        status.problem = line.problem or (self._lines[1].problem if len(self._lines) > 1 else None)
+        status.problem = line.problem
+        kept = self._lines[-1]
+        if status.problem is None and kept.problem is not None:
+            status.problem = f"the connection for the rules with offline: keep: {kept.problem}"
         status.attempts, status.connections = line.attempts, line.connections
         status.server = line.server
         channel = line.channel
@@ -479,6 +490,16 @@ class _Line:
         #: Set when the next dial is due before its time.
         self._at_once = asyncio.Event()
 
+    def __str__(self) -> str:
+        return (
+            f"{self._link}, for the rules with offline: keep" if self.is_kept else str(self._link)
+        )
+
+    @property
+    def _client_id(self) -> str:
+        """The client id that it asks for."""
+        return self._settings.client_id + ("-keep" if self.is_kept else "")
+
     def start(self) -> None:
         """Begin to dial."""
         if not self._is_stopping:
@@ -550,7 +571,7 @@ class _Line:
             channel.close(code, "the appliance stops")
             self.channel = None
             transport.close("the appliance stops")
-        return self._after(ending)
+        return self._after(ending, server)
 
     async def _until_end(self, credentials: Credentials) -> Ending:
         """Wait for the end; a login that expires is renewed before it does."""
@@ -588,7 +609,7 @@ class _Line:
         self._backoff.connected(self._loop.time())
         self.connections += 1
         self.problem = None
-        log.info("%s: connected to %s as %s", self._link, self.server, quote(channel.client_id))
+        log.info("%s: connected to %s as %s", self, self.server, quote(channel.client_id))
 
     def on_ended(self, channel: Channel, ending: Ending) -> None:
         """The connection has ended."""
@@ -596,7 +617,7 @@ class _Line:
         if self._ending is not None and not self._ending.done():
             self._ending.set_result(ending)
 
-    def _after(self, ending: Ending) -> float:
+    def _after(self, ending: Ending, server: ServerUrl) -> float:
         now = self._loop.time()
         if ending.refuses_version and self._version == V5:
             return self._fall_back()
@@ -605,13 +626,15 @@ class _Line:
             text = ending.text
             if self._backoff.is_contested(now):
                 text = (
-                    f"another client has the client id {quote(self._settings.client_id)} as well, "
-                    f"and takes the connection over again and again (waiting {wait:.0f} s)"
+                    f"another client has the client id {quote(self._client_id)} as well, and takes "
+                    f"the connection over again and again (waiting {wait:.0f} s); each needs a "
+                    "client_id of its own"
                 )
             return self._report_problem(text, wait)
         if ending.by is EndedBy.US and ending.code < 0x80:
             return 0.0
-        return self._failed(ending.text)
+        advice = ending_advice(ending, self._settings, server, self._client_id)
+        return self._failed(f"{ending.text}; {advice}" if advice else ending.text)
 
     def _fall_back(self) -> float:
         """The broker does not know MQTT 5."""
@@ -624,7 +647,7 @@ class _Line:
                 "in a circle"
             )
         self._version = V311
-        log.info("%s: %s does not know MQTT 5, going on with 3.1.1", self._link, self.server)
+        log.info("%s: %s does not know MQTT 5, going on with 3.1.1", self, self.server)
         return 0.0
 
     def _failed(self, problem: str) -> float:
@@ -633,5 +656,5 @@ class _Line:
     def _report_problem(self, problem: str, wait: float) -> float:
         if problem != self.problem:
             self.problem = problem
-            log.warning("%s: %s: %s", self._link, self.server, problem)
+            log.warning("%s: %s as %s: %s", self, self.server, quote(self._client_id), problem)
         return wait

@@ -61,7 +61,8 @@ class WebSocketClient(WebSocketLayer):
         end = head.find(b"\r\n\r\n", max(0, len(head) - len(data) - 3)) + 4
         if head[:7] != b"HTTP/1."[: len(head)]:
             self._settle(
-                f"what answers at {self._server.authority} is not HTTP: no WebSocket there"
+                f"what answers at {self._server.authority} is not HTTP: is the port one without "
+                "WebSocket?"
             )
         elif end > 3:
             self._scheduler.count_cost(HEAD_COST, self._protocol)
@@ -114,7 +115,11 @@ class WebSocketClient(WebSocketLayer):
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended, from either side."""
         if not self.upgraded.done():
-            self.upgraded.set_result("the broker closed the connection instead of an answer")
+            others = "mqtts://" if self._server.tls else "mqtt://, or one with TLS (wss://)"
+            self.upgraded.set_result(
+                "the broker closed the connection instead of an answer; is the port one for "
+                f"{others}?"
+            )
         closed = self._frames.close_rcvd
         if closed is not None:
             reason = f"{int(closed.code)} {closed.reason}".strip()

@@ -559,7 +559,7 @@ async def test_what_is_not_tls(site, web):
         assert error.step == "tls"
     with Server(saying(b"HTTP/1.1 400 Bad Request\r\n\r\n")) as server:
         error = await site.refusal(f"mqtts://localhost:{server.port}")
-    assert "is not TLS; is the port one for mqtt://?" in str(error)
+    assert "is not TLS; is the port one for mqtt:// or ws://?" in str(error)
 
 
 async def test_tls_that_is_too_old(site, tmp_path):

@@ -251,16 +251,16 @@ def test_a_session_that_is_still_there():
 @pytest.mark.parametrize(
     ("wire", "refuses_version", "words"),
     [
-        (Connack(reason_code=0x84).encode(5), True, "unsupported_protocol_version"),
-        (b"\x20\x02\x00\x01", True, "unsupported_protocol_version"),  # a server of 3.1.1
-        (Connack(reason_code=0x87).encode(5), False, "not_authorized"),
+        (Connack(reason_code=0x84).encode(5), True, "0x84 Unsupported protocol version"),
+        (b"\x20\x02\x00\x01", True, "0x84 Unsupported protocol version"),  # a server of 3.1.1
+        (Connack(reason_code=0x87).encode(5), False, "0x87 Not authorized"),
         (
             Connack(
                 reason_code=0x9D,
                 properties={Property.SERVER_REFERENCE: "b", Property.REASON_STRING: "moved\n"},
             ).encode(5),
             False,
-            "server_moved, 'moved\\n', go to 'b'",
+            "0x9d Server moved, 'moved\\n', go to 'b'",
         ),
     ],
 )
@@ -811,7 +811,7 @@ def test_the_broker_disconnects():
     assert ended is not None
     assert (ended.by, ended.code, ended.is_new) == (EndedBy.BROKER, 0x9C, False)
     assert ended.server_reference == "b:1883"
-    assert ended.text == "the broker disconnects: use_another_server, 'full', go to 'b:1883'"
+    assert ended.text == "the broker disconnects: 0x9c Use another server, 'full', go to 'b:1883'"
     assert fake.sent() == []
 
 
@@ -1340,4 +1340,4 @@ def test_mosquitto_refuses_a_wrong_password(mosquitto: MosquittoProcess, version
         real.until(lambda: real.link.ended is not None)
     assert real.link.ended is not None
     assert (real.link.ended.by, real.link.ended.refused) == (EndedBy.BROKER, True)
-    assert "not_authorized" in real.link.ended.text
+    assert "Not authorized" in real.link.ended.text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -32,9 +32,11 @@ def event_loop_policy() -> asyncio.AbstractEventLoopPolicy:
 
 
 class Rig:
-    """An appliance whose link dials `port`."""
+    """An appliance whose link dials `port`; `links` take the place of that link."""
 
-    def __init__(self, directory: Path, port: int, **link: Any) -> None:
+    def __init__(
+        self, directory: Path, port: int, *, links: Sequence[Any] = (), **link: Any
+    ) -> None:
         self.directory = directory
         directory.mkdir(exist_ok=True, parents=True)
         (directory / "acl.conf").write_text(ACL)
@@ -51,7 +53,7 @@ class Rig:
             "reload_on_change": False,
             "broker": {"listeners": [{"bind": "127.0.0.1:0"}], "anonymous": True},
             "bridge": {"bus": "none"},
-            "upstreams": [section],
+            "upstreams": list(links) or [section],
         }
         self.file = directory / "appliance.yaml"
         self.file.write_text(yaml.safe_dump(settings))
