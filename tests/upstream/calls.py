@@ -7,9 +7,9 @@ import contextlib
 import shutil
 import subprocess
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from waiting import until
 
@@ -17,10 +17,10 @@ from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish
 from upstream import account
 from upstream.client import MqttClient
-from upstream.device import HERE, THERE, Device
-from upstream.kills import make_device
-from upstream.peers import HOST, PASSWORD, USER, FleetMosquitto
+from upstream.device import HERE, THERE
+from upstream.peers import HOST, PASSWORD, USER
 from upstream.relay import Relay
+from upstream.trial import Trial
 
 #: Calls of one caller that wait for their answers.
 WINDOW = 50
@@ -86,62 +86,42 @@ class Caller:
             self.client.publish(f"{THERE}reset/_call", b"{}", 1, properties=properties)
 
 
-class Calls:
+class Calls(Trial[Report]):
     """`callers` of our own with `count` calls in all, and `others` of mosquitto_rr."""
+
+    delay = 0.005
 
     def __init__(
         self,
         directory: Path,
         *,
-        device: str = "appliance",
         count: int = 10_000,
         callers: int = 5,
         others: int = 100,
-        say: Callable[[str], None] = lambda line: None,
+        **common: Any,
     ) -> None:
-        self.directory = directory
-        self.kind = device
+        super().__init__(directory, Report(), **common)
         self.count = count
         self.callers = [Caller(f"operator{number}") for number in range(callers)]
         self.others = others
-        self.say = say
-        self.report = Report()
-        self.device: Device
 
-    def run(self) -> Report:
-        with FleetMosquitto(self.directory / "fleet") as fleet:
-            try:
-                asyncio.run(self._run(fleet))
-            finally:
-                if hasattr(self, "device"):
-                    self.device.kill()
-        return self.report
-
-    async def _run(self, fleet: FleetMosquitto) -> None:
-        async with Relay(fleet.plain_port) as relay:
-            relay.set(delay=0.005)
-            self.device = device = make_device(
-                self.kind, self.directory / "device", relay.port, "mosquitto", 100
-            )
-            await asyncio.to_thread(device.start)
-            robot = await MqttClient.dial(
-                device.port, "service", user=device.user, password=device.password
-            )
-            await robot.subscribe(f"{HERE}+/_call")
-            robot.on_message = lambda message: self._serve(robot, message)
-            for caller in self.callers:
-                await caller.connect(fleet.plain_port)
-            await self._wait_for_the_link(fleet.plain_port)
-            share = self.count // len(self.callers)
-            self.say(f"{share} calls each from {len(self.callers)} callers")
-            await asyncio.gather(*(caller.call(share) for caller in self.callers))
-            with contextlib.suppress(AssertionError):  # what does not come is told in the end
-                await until(self._complete, timeout=PATIENCE)
-            await asyncio.sleep(0.5)  # more than was asked for
-            await asyncio.to_thread(self._call_with_mosquitto, fleet.plain_port)
-            for caller in self.callers:
-                caller.client.abort()
-            robot.abort()
+    async def carry_out(self, relay: Relay, fleet: int) -> None:
+        robot = await self.dial("service")
+        await robot.subscribe(f"{HERE}+/_call")
+        robot.on_message = lambda message: self._serve(robot, message)
+        for caller in self.callers:
+            await caller.connect(fleet)
+        await self._wait_for_the_link(fleet)
+        share = self.count // len(self.callers)
+        self.say(f"{share} calls each from {len(self.callers)} callers")
+        await asyncio.gather(*(caller.call(share) for caller in self.callers))
+        with contextlib.suppress(AssertionError):  # what does not come is told in the end
+            await until(self._complete, timeout=PATIENCE)
+        await asyncio.sleep(0.5)  # more than was asked for
+        await asyncio.to_thread(self._call_with_mosquitto, fleet)
+        for caller in self.callers:
+            caller.client.abort()
+        robot.abort()
         self._add_up()
 
     def _complete(self) -> bool:
@@ -158,9 +138,7 @@ class Calls:
             robot.publish(topic, b'{"ok": true}', 1, properties=more)
 
     async def _wait_for_the_link(self, port: int) -> None:
-        robot = await MqttClient.dial(
-            self.device.port, "probe", user=self.device.user, password=self.device.password
-        )
+        robot = await self.dial("probe")
         await robot.subscribe(f"{HERE}cmd_vel")
         operator = await MqttClient.dial(port, "probe")
         deadline = time.monotonic() + PATIENCE

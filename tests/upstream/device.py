@@ -13,9 +13,10 @@ import signal
 import subprocess
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import psutil
 import yaml
@@ -61,7 +62,7 @@ IN: Sequence[Mapping[str, Any]] = (
 )
 
 
-class Device(Protocol):
+class Device(ABC):
     """What is tried."""
 
     name: str
@@ -71,24 +72,36 @@ class Device(Protocol):
     #: The most that it has in flight, and the seconds that it may forget acknowledgements of.
     window: int
     linger: float
+    process: ApplianceProcess | MosquittoBridge
 
     @property
     def port(self) -> int:
         """Of local clients; another one after each start."""
+        return self.process.plain_port
 
     @property
-    def log(self) -> str: ...
+    def log(self) -> str:
+        return self.process.log
+
+    def stop(self) -> None:
+        self.process.stop()
+
+    @abstractmethod
     def start(self) -> None: ...
-    def stop(self) -> None: ...
+
+    @abstractmethod
     def kill(self) -> None: ...
+
+    @abstractmethod
     def memory(self) -> int:
         """Bytes in memory now."""
 
+    @abstractmethod
     def status(self) -> dict[str, Any] | None:
         """Of the link, as `appliance upstream --json` has it; None where there is no such thing."""
 
 
-class ApplianceDevice:
+class ApplianceDevice(Device):
     """`appliance run` as a user starts it, with one entry of `upstreams`."""
 
     name = "appliance"
@@ -130,19 +143,8 @@ class ApplianceDevice:
         self.process.config.write_text(yaml.safe_dump(settings))
         self.database = directory / "state/store.db"
 
-    @property
-    def port(self) -> int:
-        return self.process.plain_port
-
-    @property
-    def log(self) -> str:
-        return self.process.log
-
     def start(self) -> None:
         self.process.start()
-
-    def stop(self) -> None:
-        self.process.stop()
 
     def kill(self) -> None:
         process, self.process._process = self.process._process, None
@@ -168,7 +170,7 @@ class ApplianceDevice:
         return found
 
 
-class BridgeDevice:
+class BridgeDevice(Device):
     """mosquitto's bridge; what it may lose when it is killed is what it has not saved."""
 
     name = "mosquitto"
@@ -193,14 +195,6 @@ class BridgeDevice:
             directory, remote, topics, window=window, version=version, options=options
         )
 
-    @property
-    def port(self) -> int:
-        return self.process.plain_port
-
-    @property
-    def log(self) -> str:
-        return self.process.log
-
     def start(self) -> None:
         # A socket of the killed one may still be there, so that its port is not free at once.
         deadline = time.monotonic() + 10
@@ -209,9 +203,6 @@ class BridgeDevice:
                 self.process.start()
                 return
             assert time.monotonic() < deadline, self.process.log[-2000:]
-
-    def stop(self) -> None:
-        self.process.stop()
 
     def kill(self) -> None:
         self.process.kill()

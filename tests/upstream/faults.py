@@ -5,19 +5,18 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from appliance.mqtt.packets import Publish
 from upstream import account
 from upstream.account import State
 from upstream.client import MqttClient
-from upstream.device import HERE, THERE, Device
-from upstream.kills import make_device
-from upstream.peers import FleetMosquitto
+from upstream.device import HERE, THERE
 from upstream.relay import Relay
-from upstream.streams import Side, Sink, Source
+from upstream.streams import Side, Sink, Source, running
+from upstream.trial import Trial
 
 #: Of the link (device.ApplianceDevice), in seconds.
 KEEP_ALIVE = 5.0
@@ -66,74 +65,46 @@ class Report:
         )
 
 
-class Faults:
+class Faults(Trial[Report]):
     """One fault after the other, with a good line between them; then all is added up."""
 
     def __init__(
-        self,
-        directory: Path,
-        seed: int,
-        *,
-        device: str = "appliance",
-        seconds: float = 600.0,
-        say: Callable[[str], None] = lambda line: None,
+        self, directory: Path, seed: int, *, seconds: float = 600.0, **common: Any
     ) -> None:
-        self.directory = directory
-        self.kind = device
+        super().__init__(directory, Report(seed), **common)
         self.seconds = seconds
-        self.say = say
-        self.report = Report(seed)
         self.random = random.Random(seed)
-        self.device: Device
         self.states: list[State] = []
         #: Spans of time, and whether the line carried in them: for `account.truth`.
         self.carried: list[tuple[float, float, bool]] = []
 
-    def run(self) -> Report:
-        with FleetMosquitto(self.directory / "fleet") as fleet:
-            try:
-                asyncio.run(self._run(fleet))
-            finally:
-                if hasattr(self, "device"):
-                    self.device.kill()
-        return self.report
-
-    async def _run(self, fleet: FleetMosquitto) -> None:
-        async with Relay(fleet.plain_port) as relay:
-            self.device = device = make_device(
-                self.kind, self.directory / "device", relay.port, "mosquitto", 100
-            )
-            await asyncio.to_thread(device.start)
-            here = Side(lambda: device.port, device.user, device.password)
-            there = Side(lambda: fleet.plain_port)
-            outward = Sink(there, "fleet-sink", f"{THERE}events/#")
-            inward = Sink(here, "robot-sink", f"{HERE}mission/#")
-            sources = [
-                Source(here, "robot-1", f"{HERE}events/one", rate=RATE, window=1000),
-                Source(there, "fleet-1", f"{THERE}mission/one", rate=RATE, window=1000),
-            ]
-            watch = await MqttClient.dial(fleet.plain_port, "watch")
-            watch.on_message = self._took_state
-            await watch.subscribe(f"{THERE}_appliance/state")
-            here.up.set()
-            there.up.set()
-            tasks = [asyncio.create_task(each.run()) for each in (outward, inward, *sources)]
-            self.pairs = [
-                (sources[0], outward, f"{THERE}events/one"),
-                (sources[1], inward, f"{HERE}mission/one"),
-            ]
-            try:
-                await self._flows(time.monotonic())
-                await self._disturb(relay)
-                for source in sources:
-                    source.stopping = True
-                await self._settle()
-            finally:
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
-            watch.abort()
-            self._add_up(relay)
+    async def carry_out(self, relay: Relay, fleet: int) -> None:
+        device = self.device
+        here = Side(lambda: device.port, device.user, device.password)
+        there = Side(lambda: fleet)
+        outward = Sink(there, "fleet-sink", f"{THERE}events/#")
+        inward = Sink(here, "robot-sink", f"{HERE}mission/#")
+        sources = [
+            Source(here, "robot-1", f"{HERE}events/one", rate=RATE, window=1000),
+            Source(there, "fleet-1", f"{THERE}mission/one", rate=RATE, window=1000),
+        ]
+        watch = await MqttClient.dial(fleet, "watch")
+        watch.on_message = self._took_state
+        await watch.subscribe(f"{THERE}_appliance/state")
+        here.up.set()
+        there.up.set()
+        self.pairs = [
+            (sources[0], outward, f"{THERE}events/one"),
+            (sources[1], inward, f"{HERE}mission/one"),
+        ]
+        async with running(outward, inward, *sources):
+            await self._flows(time.monotonic())
+            await self._disturb(relay)
+            for source in sources:
+                source.stopping = True
+            await self._settle()
+        watch.abort()
+        self._add_up(relay)
 
     def _took_state(self, message: Publish) -> None:
         self.states.append(State(time.monotonic(), message.payload.decode()))

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from appliance.mqtt.packets import Publish
 from upstream import account
 from upstream.account import Command
 from upstream.client import MqttClient
-from upstream.device import HERE, THERE, Device
-from upstream.kills import make_device
-from upstream.peers import FleetMosquitto
+from upstream.device import HERE, THERE
 from upstream.relay import Relay
-from upstream.streams import Side, Sink
+from upstream.streams import Side, Sink, running
+from upstream.trial import Trial
 
 #: Of Twist, a second.
 RATE = 20
@@ -58,60 +57,33 @@ class Report:
         )
 
 
-class LateCommands:
+class LateCommands(Trial[Report]):
     """Twists at 20 Hz with QoS 0 and 1, silences of the line, and 1,000 commands while it is away.
 
     The robot's client stands for ROS: what it gets, a route to ROS gets.
     """
 
+    delay = 0.02
+
     def __init__(
-        self,
-        directory: Path,
-        *,
-        device: str = "appliance",
-        silence: float = 10.0,
-        rounds: int = 3,
-        say: Callable[[str], None] = lambda line: None,
+        self, directory: Path, *, silence: float = 10.0, rounds: int = 3, **common: Any
     ) -> None:
-        self.directory = directory
-        self.kind = device
+        super().__init__(directory, Report(), **common)
         self.silence = silence
         self.rounds = rounds
-        self.say = say
-        self.report = Report()
-        self.device: Device
         self._sent: dict[int, float] = {}
 
-    def run(self) -> Report:
-        with FleetMosquitto(self.directory / "fleet") as fleet:
-            try:
-                asyncio.run(self._run(fleet))
-            finally:
-                if hasattr(self, "device"):
-                    self.device.kill()
-        return self.report
-
-    async def _run(self, fleet: FleetMosquitto) -> None:
-        async with Relay(fleet.plain_port) as relay:
-            relay.set(delay=0.02)
-            self.device = make_device(
-                self.kind, self.directory / "device", relay.port, "mosquitto", 100
-            )
-            await asyncio.to_thread(self.device.start)
-            device = self.device
-            here = Side(lambda: device.port, device.user, device.password)
-            robot = Sink(here, "robot", f"{HERE}cmd_vel")
-            robot.took = self._took  # type: ignore[method-assign]
-            here.up.set()
-            task = asyncio.create_task(robot.run())
-            try:
-                await asyncio.wait_for(robot.subscribed.wait(), 60)
-                operator = await MqttClient.dial(fleet.plain_port, "operator")
-                await self._try(relay, operator)
-                operator.abort()
-            finally:
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
+    async def carry_out(self, relay: Relay, fleet: int) -> None:
+        device = self.device
+        here = Side(lambda: device.port, device.user, device.password)
+        robot = Sink(here, "robot", f"{HERE}cmd_vel")
+        robot.took = self._took  # type: ignore[method-assign]
+        here.up.set()
+        async with running(robot):
+            await asyncio.wait_for(robot.subscribed.wait(), 60)
+            operator = await MqttClient.dial(fleet, "operator")
+            await self._try(relay, operator)
+            operator.abort()
 
     def _took(self, message: Publish) -> None:
         number = int(message.payload.split(b" ", 1)[0])

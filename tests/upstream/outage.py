@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,9 @@ from typing import Any
 from upstream import account
 from upstream.client import MqttClient
 from upstream.device import HERE, THERE, ApplianceDevice, BridgeDevice, Device, count
-from upstream.peers import FleetMosquitto
 from upstream.relay import Relay
-from upstream.streams import Side, Sink
+from upstream.streams import Side, Sink, running
+from upstream.trial import Trial
 
 #: How much the device may grow, in bytes.
 GROWTH = 64 << 20
@@ -58,7 +57,7 @@ class Report:
         )
 
 
-class Outage:
+class Outage(Trial[Report]):
     """Publishes while the fleet is away, then lets it come back.
 
     `size` is the backlog's (as appliance.yaml has it); with `restarts` the device is killed with
@@ -69,52 +68,31 @@ class Outage:
         self,
         directory: Path,
         *,
-        device: str = "appliance",
         messages: int = 2_880_000,
         payload: int = 100,
         size: str = "64 MiB",
         rate: float | None = None,
         restarts: bool = False,
         queue: int = 0,
-        say: Callable[[str], None] = lambda line: None,
+        **common: Any,
     ) -> None:
-        self.directory = directory
-        self.kind = device
+        super().__init__(directory, Report(), **common)
         self.messages = messages
         self.payload = payload
         self.size = size
         self.rate = rate
         self.restarts = restarts
         self.queue = queue
-        self.say = say
-        self.report = Report()
-        self.device: Device
 
-    def run(self) -> Report:
-        with FleetMosquitto(self.directory / "fleet") as fleet:
-            try:
-                asyncio.run(self._run(fleet))
-            finally:
-                if hasattr(self, "device"):
-                    self.device.kill()
-        return self.report
+    async def carry_out(self, relay: Relay, fleet: int) -> None:
+        there = Side(lambda: fleet)
+        sink = Sink(there, "fleet-sink", f"{THERE}events/#", f"{THERE}state/#")
+        sink.verbatim = (f"{THERE}state/",)
+        there.up.set()
+        async with running(sink):
+            await self._try(relay, sink)
 
-    async def _run(self, fleet: FleetMosquitto) -> None:
-        async with Relay(fleet.plain_port) as relay:
-            self.device = self._make(relay.port)
-            await self._start()
-            there = Side(lambda: fleet.plain_port)
-            sink = Sink(there, "fleet-sink", f"{THERE}events/#", f"{THERE}state/#")
-            sink.verbatim = (f"{THERE}state/",)
-            there.up.set()
-            task = asyncio.create_task(sink.run())
-            try:
-                await self._try(relay, sink)
-            finally:
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-
-    def _make(self, remote: int) -> Device:
+    def make_device(self, remote: int) -> Device:
         if self.kind == "mosquitto":
             options = f"max_queued_messages {self.queue}"
             return BridgeDevice(self.directory / "device", remote, options=options)
@@ -125,18 +103,14 @@ class Outage:
         """Seconds until a local CONNECT is answered."""
         began = time.monotonic()
         await asyncio.to_thread(self.device.start)
-        client = await self._dial("first")
+        client = await self.dial("first")
         took = time.monotonic() - began
         client.abort()
         return took
 
-    async def _dial(self, name: str) -> MqttClient:
-        device = self.device
-        return await MqttClient.dial(device.port, name, user=device.user, password=device.password)
-
     async def _try(self, relay: Relay, sink: Sink) -> None:
         await asyncio.wait_for(sink.subscribed.wait(), 60)
-        robot = await self._dial("robot")
+        robot = await self.dial("robot")
         topic = f"{THERE}events/probe"
         while not sink.received.get(topic):  # the link is up
             await robot.publish(f"{HERE}events/probe", b"1 ")
@@ -148,7 +122,7 @@ class Outage:
         await relay.refuse()
         await asyncio.sleep(1)  # until nothing is in flight any more
         before = count(self._status(), "dropped") or 0
-        robot = await self._dial("robot")
+        robot = await self.dial("robot")
         latest = await self._publish(robot)
         robot.abort()
         if self.restarts:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import random
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 
 from appliance.mqtt.codec import V5, V311
@@ -92,6 +92,17 @@ class Member:
 
     def took(self, message: Publish) -> None:
         """A message came."""
+
+
+@contextlib.asynccontextmanager
+async def running(*members: Member) -> AsyncIterator[None]:
+    tasks = [asyncio.create_task(each.run()) for each in members]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 class Source(Member):

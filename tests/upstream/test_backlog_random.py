@@ -402,12 +402,9 @@ def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LOADED_SHARE", 300)
 
 
-@pytest.mark.usefixtures("little_memory")
-@pytest.mark.parametrize("seed", range(20))
-def test_like_a_list(seed: int) -> None:
-    twin = Twin(seed, MIXED)
+def _compare(twin: Twin, seed: int, operations: list[str]) -> None:
     for _ in range(300):
-        operation = twin.choose.choice(OPERATIONS)
+        operation = twin.choose.choice(operations)
         if operation != "next" or twin.online:
             getattr(twin, operation)()
             twin.check()
@@ -415,18 +412,15 @@ def test_like_a_list(seed: int) -> None:
         twin.drain()
     else:
         twin.kill()
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("seed", range(20))
+def test_like_a_list(seed: int) -> None:
+    _compare(Twin(seed, MIXED), seed, OPERATIONS)
 
 
 @pytest.mark.usefixtures("little_memory")
 @pytest.mark.parametrize("seed", range(20))
 def test_like_a_full_list(seed: int) -> None:
-    twin = Twin(seed, PLAIN, size=4_000)
-    for _ in range(300):
-        operation = twin.choose.choice(OPERATIONS + ["offer"] * 10)
-        if operation != "next" or twin.online:
-            getattr(twin, operation)()
-            twin.check()
-    if seed % 2:
-        twin.drain()
-    else:
-        twin.kill()
+    _compare(Twin(seed, PLAIN, size=4_000), seed, OPERATIONS + ["offer"] * 10)

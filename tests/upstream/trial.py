@@ -1,0 +1,66 @@
+"""What all tries of the link begin and end with: a fleet's mosquitto, a line to it, a device."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from upstream.client import MqttClient
+from upstream.device import Device
+from upstream.kills import make_device
+from upstream.peers import FleetMosquitto
+from upstream.relay import Relay
+
+Report = TypeVar("Report")
+
+
+class Trial(Generic[Report]):
+    """Builds all three, tries what its class is about, and ends them."""
+
+    #: Of the line, in seconds one way.
+    delay = 0.0
+
+    def __init__(
+        self,
+        directory: Path,
+        report: Report,
+        *,
+        device: str = "appliance",
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.directory = directory
+        self.report = report
+        self.kind = device
+        self.say = say
+        self.device: Device
+
+    def run(self) -> Report:
+        with FleetMosquitto(self.directory / "fleet") as fleet:
+            try:
+                asyncio.run(self._run(fleet.plain_port))
+            finally:
+                if hasattr(self, "device"):
+                    self.device.kill()
+        return self.report
+
+    async def _run(self, fleet: int) -> None:
+        async with Relay(fleet) as relay:
+            relay.set(delay=self.delay)
+            self.device = self.make_device(relay.port)
+            await asyncio.to_thread(self.device.start)
+            await self.carry_out(relay, fleet)
+
+    def make_device(self, remote: int) -> Device:
+        """It connects to the port `remote`; it is not started."""
+        return make_device(self.kind, self.directory / "device", remote, "mosquitto", 100)
+
+    async def dial(self, name: str) -> MqttClient:
+        """A local client of the device."""
+        device = self.device
+        return await MqttClient.dial(device.port, name, user=device.user, password=device.password)
+
+    async def carry_out(self, relay: Relay, fleet: int) -> None:
+        """What is tried; `fleet` is the port of the fleet's broker without the line."""
+        raise NotImplementedError
