@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_connection import (
-    ACKNOWLEDGEMENTS,
     SAYABLE,
-    as_packet,
+    check_damage,
+    check_splits,
     resolve,
-    same,
-    split_at,
+    said,
+    some_cuts,
+    some_damage,
     versions,
     with_pairs,
     without_pairs,
@@ -28,7 +28,6 @@ from appliance.mqtt.framing import (
     MAXIMUM_CONNECT,
     MAXIMUM_CONTROL,
     UNAUTHENTICATED_PAIRS,
-    Event,
     State,
 )
 from appliance.mqtt.packets import (
@@ -80,27 +79,6 @@ def connected(version: int = 5, size: int = SIZE, method: bool = False) -> Clien
     ]
     assert client.state is State.CONNECTED
     return client
-
-
-def to_packet(event: Event, version: int) -> Packet:
-    """What an event says, as the packet that it stands for."""
-    if isinstance(event, int):
-        kind = ACKNOWLEDGEMENTS[PacketType(event >> 16 & 0xFF)]
-        return kind(event & 0xFFFF, ReasonCode(event >> 24))
-    return as_packet(event, version)
-
-
-def said(client: ClientProtocol, chunks: Iterable[bytes]) -> list[Packet | ReasonCode]:
-    """All that the client makes of the chunks, and the error that ended it."""
-    found: list[Packet | ReasonCode] = []
-    try:
-        for chunk in chunks:
-            for event in client.receive_data(chunk):
-                found.append(to_packet(event, client.version))
-    except ProtocolError as error:
-        found.append(error.code)
-        client.close()  # as the owner does, for a topic that is not valid
-    return found
 
 
 def said_slowly(data: bytes, version: int) -> list[Packet | ReasonCode]:
@@ -160,31 +138,16 @@ def conversations(draw) -> tuple[int, list[bytes]]:
     return version, draw(st.permutations(wires))
 
 
-@given(conversations(), st.lists(st.integers(0), max_size=12))
+@given(conversations(), some_cuts)
 @settings(max_examples=300, deadline=None)
 def test_any_split_gives_the_same_events_as_the_full_decoder(conversation, cuts):
-    version, wires = conversation
-    data = b"".join(wires)
-    expected = said_slowly(data, version)
-    assert same(said(connected(version), [data]), expected)
-    assert same(said(connected(version), split_at(data, cuts)), expected)
-    assert same(said(connected(version), [data[n : n + 1] for n in range(len(data))]), expected)
+    check_splits(connected, said_slowly, conversation, cuts)
 
 
-@given(
-    conversations(),
-    st.lists(st.tuples(st.integers(0), st.integers(0, 255)), min_size=1, max_size=4),
-    st.lists(st.integers(0), max_size=4),
-)
+@given(conversations(), some_damage, some_cuts)
 @settings(max_examples=400, deadline=None)
-def test_damaged_bytes_are_refused_as_by_the_full_decoder(conversation, damages, cuts):
-    version, wires = conversation
-    data = bytearray(b"".join(wires) or b"\xd0\0")
-    for place, byte in damages:
-        data[place % len(data)] = byte
-    expected = said_slowly(bytes(data), version)
-    assert same(said(connected(version), [bytes(data)]), expected)
-    assert same(said(connected(version), split_at(bytes(data), cuts)), expected)
+def test_damaged_bytes_are_refused_as_by_the_full_decoder(conversation, damage, cuts):
+    check_damage(connected, said_slowly, conversation, damage, cuts)
 
 
 @given(st.binary(max_size=60), versions, st.booleans(), st.booleans())

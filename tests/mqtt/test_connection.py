@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_properties import binaries, connects, packets, publishes, topics
 
+from appliance.mqtt.client_protocol import ClientProtocol
 from appliance.mqtt.codec import Property, decode_properties, decode_string, encode_varint
 from appliance.mqtt.connection import ServerProtocol
 from appliance.mqtt.framing import MAXIMUM_CONNECT, MAXIMUM_CONTROL, Event, State
@@ -58,7 +59,8 @@ def connected(version: int, size: int = SIZE) -> ServerProtocol:
 def as_packet(event: Event, version: int) -> Packet:
     """What an event says, as the packet that it stands for."""
     if isinstance(event, int):
-        return ACKNOWLEDGEMENTS[PacketType(event >> 16)](event & 0xFFFF)
+        kind = ACKNOWLEDGEMENTS[PacketType(event >> 16 & 0xFF)]
+        return kind(event & 0xFFFF, ReasonCode(event >> 24))
     if not isinstance(event, tuple):
         return with_pairs(event)
     first, topic_wire, packet_id, payload, head = event
@@ -107,7 +109,9 @@ def without_pairs(packet: Packet) -> Packet:
     return packet
 
 
-def said(connection: ServerProtocol, chunks: Iterable[bytes]) -> list[Packet | ReasonCode]:
+def said(
+    connection: ServerProtocol | ClientProtocol, chunks: Iterable[bytes]
+) -> list[Packet | ReasonCode]:
     """All that the connection makes of the chunks, and the error that ended it."""
     found: list[Packet | ReasonCode] = []
     try:
@@ -116,7 +120,7 @@ def said(connection: ServerProtocol, chunks: Iterable[bytes]) -> list[Packet | R
                 found.append(as_packet(event, connection.version))
     except ProtocolError as error:
         found.append(error.code)
-        connection.close()  # as the route's owner does, for a topic that is not valid
+        connection.close()  # as its owner does, for a topic that is not valid
     return found
 
 
@@ -200,6 +204,26 @@ def same(found: list[Packet | ReasonCode], expected: list[Packet | ReasonCode]) 
 
 
 versions = st.sampled_from([4, 5])
+some_cuts = st.lists(st.integers(0), max_size=12)
+some_damage = st.lists(st.tuples(st.integers(0), st.integers(0, 255)), min_size=1, max_size=4)
+
+
+def check_splits(connected, said_slowly, conversation, cuts) -> None:
+    """Whole, cut somewhere and byte by byte, it is what the full decoder says."""
+    version, wires = conversation
+    data = b"".join(wires)
+    expected = said_slowly(data, version)
+    for chunks in ([data], split_at(data, cuts), [data[n : n + 1] for n in range(len(data))]):
+        assert same(said(connected(version), chunks), expected)
+
+
+def check_damage(connected, said_slowly, conversation, damage, cuts) -> None:
+    """With some bytes damaged as well."""
+    version, wires = conversation
+    data = bytearray(b"".join(wires) or b"\xd0\0")
+    for place, byte in damage:
+        data[place % len(data)] = byte
+    check_splits(connected, said_slowly, (version, [bytes(data)]), cuts)
 
 
 @st.composite
@@ -212,31 +236,16 @@ def conversations(draw) -> tuple[int, list[bytes]]:
     return version, draw(st.permutations(wires))
 
 
-@given(conversations(), st.lists(st.integers(0), max_size=12))
+@given(conversations(), some_cuts)
 @settings(max_examples=300, deadline=None)
 def test_any_split_gives_the_same_events_as_the_full_decoder(conversation, cuts):
-    version, wires = conversation
-    data = b"".join(wires)
-    expected = said_slowly(data, version)
-    assert same(said(connected(version), [data]), expected)
-    assert same(said(connected(version), split_at(data, cuts)), expected)
-    assert same(said(connected(version), [data[n : n + 1] for n in range(len(data))]), expected)
+    check_splits(connected, said_slowly, conversation, cuts)
 
 
-@given(
-    conversations(),
-    st.lists(st.tuples(st.integers(0), st.integers(0, 255)), min_size=1, max_size=4),
-    st.lists(st.integers(0), max_size=4),
-)
+@given(conversations(), some_damage, some_cuts)
 @settings(max_examples=500, deadline=None)
-def test_damaged_bytes_are_refused_as_by_the_full_decoder(conversation, damages, cuts):
-    version, wires = conversation
-    data = bytearray(b"".join(wires))
-    for place, byte in damages:
-        data[place % len(data)] = byte
-    expected = said_slowly(bytes(data), version)
-    assert same(said(connected(version), [bytes(data)]), expected)
-    assert same(said(connected(version), split_at(bytes(data), cuts)), expected)
+def test_damaged_bytes_are_refused_as_by_the_full_decoder(conversation, damage, cuts):
+    check_damage(connected, said_slowly, conversation, damage, cuts)
 
 
 @given(versions, publishes(4), st.integers(0), st.integers(0, 255))
