@@ -6,9 +6,10 @@ from appliance.net.callbacks import Entries
 from appliance.store.clock import StoreClock
 from appliance.store.committer import Committer
 from appliance.store.journal import StoredJournal
+from appliance.store.link_backlogs import LinkBacklogs
 from appliance.store.loader import LoadedBacklogs
 from appliance.store.reader import Reader
-from appliance.store.rows import LATEST, SET_ASIDE, Table
+from appliance.store.rows import Table
 
 
 class StoredLatestRecords:
@@ -46,16 +47,15 @@ class StoredLatestRecords:
             self._committer.stage_lazily()
 
 
-class StoredBacklogs:
+class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords]):
     """`Backlogs` in the database of the committer."""
 
     def __init__(self, committer: Committer, clock: StoreClock) -> None:
+        super().__init__()
         self._committer = committer
         self._clock = clock
         self._reader: Reader | None = None
         self._loaded = LoadedBacklogs()
-        self._journals: dict[tuple[str, int], StoredJournal] = {}
-        self._latest: dict[tuple[str, int], StoredLatestRecords] = {}
 
     def restore(self, loaded: LoadedBacklogs, entries: Entries) -> None:
         """Take over what is in the database, before anything is committed."""
@@ -65,7 +65,7 @@ class StoredBacklogs:
         for link, lane in loaded.segments:
             self.journal(link, lane)
         for link, kind in loaded.records:
-            self._records(link, kind)
+            self.records(link, kind)
 
     async def stop_reading(self) -> None:
         """Read nothing any more; may be called twice, and before `restore`."""
@@ -81,45 +81,11 @@ class StoredBacklogs:
         """See `Backlogs`."""
         return self._committer.failing
 
-    def journal(self, link: str, lane: int) -> StoredJournal:
-        """See `Backlogs`."""
-        found = self._journals.get((link, lane))
-        if found is None:
-            assert self._reader is not None, "not before `restore`"
-            segments = self._loaded.segments.get((link, lane), [])
-            found = self._journals[link, lane] = StoredJournal(
-                link, lane, segments, self._committer, self._reader, self._clock
-            )
-        return found
+    def _make_journal(self, link: str, lane: int) -> StoredJournal:
+        assert self._reader is not None, "not before `restore`"
+        segments = self._loaded.segments.get((link, lane), [])
+        return StoredJournal(link, lane, segments, self._committer, self._reader, self._clock)
 
-    def latest(self, link: str) -> StoredLatestRecords:
-        """See `Backlogs`."""
-        return self._records(link, LATEST)
-
-    def aside(self, link: str) -> StoredLatestRecords:
-        """See `Backlogs`."""
-        return self._records(link, SET_ASIDE)
-
-    def _records(self, link: str, kind: int) -> StoredLatestRecords:
-        found = self._latest.get((link, kind))
-        if found is None:
-            records = self._loaded.records.get((link, kind), {})
-            found = StoredLatestRecords(link, kind, records, self._committer)
-            self._latest[link, kind] = found
-        return found
-
-    def links(self) -> list[str]:
-        """See `Backlogs`."""
-        names = {link for (link, _), journal in self._journals.items() if journal.segments()}
-        names |= {link for (link, _), records in self._latest.items() if records.load()}
-        return sorted(names)
-
-    def forget(self, link: str) -> None:
-        """See `Backlogs`."""
-        for (name, _), journal in self._journals.items():
-            if name == link:
-                for segment in list(journal.segments()):
-                    journal.drop(segment)
-        for records in (self.latest(link), self.aside(link)):
-            for key, _ in records.load():
-                records.remove(key)
+    def _make_records(self, link: str, kind: int) -> StoredLatestRecords:
+        records = self._loaded.records.get((link, kind), {})
+        return StoredLatestRecords(link, kind, records, self._committer)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 
 from appliance.broker.ports import SEGMENT_SIZE, RecordsRead, Segment
+from appliance.store.link_backlogs import LinkBacklogs
 
 #: Calls the function in a later round of the event loop.
 Soon = Callable[[Callable[[], None]], object]
@@ -96,52 +97,19 @@ class MemoryLatestRecords:
         self._records.pop(key, None)
 
 
-class MemoryBacklogs:
+class MemoryBacklogs(LinkBacklogs[MemoryJournal, MemoryLatestRecords]):
     """`Backlogs` in memory; `soon` calls in a later round of the event loop."""
 
     failing = False
 
     def __init__(self, soon: Soon, now: Callable[[], float]) -> None:
+        super().__init__()
         self._soon = soon
         self._now = now
         self._keys = itertools.count(1)
-        self._journals: dict[tuple[str, int], MemoryJournal] = {}
-        self._latest: dict[str, MemoryLatestRecords] = {}
-        self._aside: dict[str, MemoryLatestRecords] = {}
 
-    def journal(self, link: str, lane: int) -> MemoryJournal:
-        """See `Backlogs`."""
-        found = self._journals.get((link, lane))
-        if found is None:
-            found = self._journals[link, lane] = MemoryJournal(self._keys, self._soon, self._now)
-        return found
+    def _make_journal(self, link: str, lane: int) -> MemoryJournal:
+        return MemoryJournal(self._keys, self._soon, self._now)
 
-    def latest(self, link: str) -> MemoryLatestRecords:
-        """See `Backlogs`."""
-        return self._of_link(self._latest, link)
-
-    def aside(self, link: str) -> MemoryLatestRecords:
-        """See `Backlogs`."""
-        return self._of_link(self._aside, link)
-
-    def _of_link(self, found: dict[str, MemoryLatestRecords], link: str) -> MemoryLatestRecords:
-        if link not in found:
-            found[link] = MemoryLatestRecords(self._keys)
-        return found[link]
-
-    def links(self) -> list[str]:
-        """See `Backlogs`."""
-        names = {link for (link, _), journal in self._journals.items() if journal.segments()}
-        for kind in (self._latest, self._aside):
-            names |= {link for link, records in kind.items() if records.load()}
-        return sorted(names)
-
-    def forget(self, link: str) -> None:
-        """See `Backlogs`."""
-        for (name, _), journal in self._journals.items():
-            if name == link:
-                for segment in list(journal.segments()):
-                    journal.drop(segment)
-        for kind in (self._latest, self._aside):
-            for key, _ in self._of_link(kind, link).load():
-                self._of_link(kind, link).remove(key)
+    def _make_records(self, link: str, kind: int) -> MemoryLatestRecords:
+        return MemoryLatestRecords(self._keys)

@@ -62,14 +62,18 @@ class Harness:
     async def stop(self) -> None:
         await self.store.close()
 
-    def twin(self, directory: Path) -> Harness:
-        """A second broker, with what would be stored if the process had been killed now."""
+    def copy(self, directory: Path) -> Harness:
+        """Not started, with what would be stored if the process had been killed now."""
         copy = Harness(directory, self.limits, **self.options)
         copy.path.parent.mkdir(parents=True)
         for name in (self.path.name, f"{self.path.name}-wal"):
             if (self.path.parent / name).exists():
                 shutil.copyfile(self.path.parent / name, copy.path.parent / name)
-        return copy.start()
+        return copy
+
+    def twin(self, directory: Path) -> Harness:
+        """A second broker, started from a copy."""
+        return self.copy(directory).start()
 
 
 def state(broker: Broker) -> dict[str, Any]:

@@ -166,12 +166,7 @@ async def test_a_newer_database_is_left_alone(
 @pytest.mark.parametrize("seed", range(5))
 async def test_it_always_starts(harness: Harness, tmp_path: Path, harm: str, seed: int) -> None:
     await harness.written()
-    copy = Harness(tmp_path / "copy")
-    twin = harness.twin(tmp_path / "twin")
-    copy.path.parent.mkdir(parents=True)
-    for name in ("store.db", "store.db-wal"):
-        (copy.path.parent / name).write_bytes((harness.path.parent / name).read_bytes())
-    await twin.stop()
+    copy = harness.copy(tmp_path / "copy")
     HARMS[harm](copy.path, random.Random(seed))
     copy.start()
     # And what is there now is sound: it can be added to, and read again.

@@ -103,13 +103,18 @@ async def test_of_a_backlog_without_its_index_the_records_are_enough(tmp_path: P
     await harness.stop()
 
 
+async def _with_a_wiped_page(directory: Path) -> tuple[Harness, int]:
+    """Started, and the number of a record that cannot be read."""
+    harness = await _filled(directory)
+    large = next(n for n in range(30, 120) if len(_record(n)) > 20_000)
+    _wipe(harness.path, _page_of(harness.path, b"%08d " % large))
+    return harness.start(), large
+
+
 async def test_a_wiped_page_costs_one_segment(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    harness = await _filled(tmp_path)
-    large = next(n for n in range(30, 120) if len(_record(n)) > 20_000)
-    _wipe(harness.path, _page_of(harness.path, b"%08d " % large))
-    harness.start()
+    harness, large = await _with_a_wiped_page(tmp_path)
     assert "DAMAGED" not in caplog.text  # nobody has read it yet
     journal = opened(harness)
     damaged = journal.segments()[large // 3]
@@ -139,10 +144,7 @@ async def test_a_wiped_page_costs_one_segment(
 async def test_damaged_records_that_are_dropped_unread_do_not_stop_the_store(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    harness = await _filled(tmp_path)
-    large = next(n for n in range(30, 120) if len(_record(n)) > 20_000)
-    _wipe(harness.path, _page_of(harness.path, b"%08d " % large))
-    harness.start()
+    harness, large = await _with_a_wiped_page(tmp_path)
     journal = opened(harness)
     for segment in list(journal.segments())[: large // 3 + 3]:
         journal.drop(segment)
@@ -187,10 +189,7 @@ async def test_whatever_was_damaged_the_rest_is_in_order(
     for number in range(120, 180):
         opened(harness).append(_record(number))
         await harness.written()
-    copy = Harness(tmp_path / "copy")
-    copy.path.parent.mkdir(parents=True)
-    for name in ("store.db", "store.db-wal"):
-        (copy.path.parent / name).write_bytes((harness.path.parent / name).read_bytes())
+    copy = harness.copy(tmp_path / "copy")
     await harness.stop()
     HARMS[harm](copy.path, random.Random(seed))
     copy.start()
