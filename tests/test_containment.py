@@ -895,6 +895,7 @@ ELSEWHERE = {
         ),
         "upstream/test_dial.py",
     ),
+    "upstream.return": "upstream/test_servers.py",
     "stop.session": "test_containment.py",
     "store.read": "store/test_memory_backlogs.py",
 }

@@ -111,7 +111,8 @@ class Ending:
     `code` is the reason code, UNSPECIFIED_ERROR where there is none. `refused` says that CONNACK
     had an error, `is_new` that the connection ended before CONNACK or by it: some brokers that do
     not know a version say so (`refuses_version`), some only close the connection. `is_silent` says
-    that nothing was heard any more, `is_violation` that the broker has violated the protocol.
+    that nothing was heard any more, `is_violation` that the broker has violated the protocol,
+    `is_close` that it has closed the connection between two packets, and said no reason.
     """
 
     by: EndedBy
@@ -122,6 +123,7 @@ class Ending:
     server_reference: str | None = None
     is_silent: bool = False
     is_violation: bool = False
+    is_close: bool = False
 
     @property
     def refuses_version(self) -> bool:

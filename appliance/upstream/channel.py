@@ -107,6 +107,10 @@ class Channel:
         self._turn: asyncio.TimerHandle | None = None
         self._turn_at = 0.0
         self._has_ended = False
+        #: Why the connection ends as soon as nothing is under way; empty while it stays.
+        self._leaving = ""
+        #: The broker has answered all subscriptions.
+        self.is_subscribed = False
 
     def __str__(self) -> str:
         return str(self.connection)
@@ -117,6 +121,7 @@ class Channel:
         return (
             not self._has_ended
             and self._transport is not None
+            and not self._leaving
             and self._transport.writable
             and self.connection.granted is not None
         )
@@ -156,7 +161,8 @@ class Channel:
 
     def lost(self, reason: str) -> None:
         """See `TransportOwner`."""
-        self.connection.lost(reason)
+        was_closed = self._transport is not None and self._transport.was_closed
+        self.connection.lost(reason, is_close=was_closed)
         self._finish()
 
     @property
@@ -195,7 +201,7 @@ class Channel:
         elif isinstance(event, Subscribed):
             self._refused += [each for each in event.results if each[1] >= 0x80]
             if event.complete:
-                self._owner.subscribed(self, self._refused)
+                self._subscribed()
         elif isinstance(event, Challenged):
             self.connection.close(
                 ReasonCode.BAD_AUTHENTICATION_METHOD, "it asks for more than a token"
@@ -205,19 +211,25 @@ class Channel:
         self.inward = self._owner.receive(self)
         self._owner.opened(self)
         if not self._subscriptions:
-            self._owner.subscribed(self, [])
+            self._subscribed()
             return
         self._refused = self.connection.subscribe(self._subscriptions)
         if len(self._refused) == len(self._subscriptions):
-            self._owner.subscribed(self, self._refused)
+            self._subscribed()
         if self._ping_interval < math.inf:
             self._ping()
+
+    def _subscribed(self) -> None:
+        self.is_subscribed = True
+        self._owner.subscribed(self, self._refused)
 
     def _after(self, now: float) -> None:
         """At the end of a round: commit, send on, write, and look at the times again."""
         self._broker.flush()
         if self.connection.ended is None:
             self._owner.send_more(self)
+            if self._leaving and not self._is_under_way():
+                self.connection.close(ReasonCode.SUCCESS, self._leaving)
         self.write(now)
 
     def write(self, now: float) -> None:
@@ -270,6 +282,18 @@ class Channel:
         self.write(self._loop.time())
 
     # --- the end ----------------------------------------------------------------------------------
+
+    def leave(self, reason: str) -> None:
+        """Send no more messages, and end the connection as soon as nothing is under way on it."""
+        if not self._has_ended:
+            self._leaving = reason
+            self._after(self._loop.time())
+
+    def _is_under_way(self) -> bool:
+        """Whether either end owes the other an acknowledgement, or a message waits here."""
+        connection = self.connection
+        is_waiting = self.inward is not None and self.inward.waiting > 0
+        return is_waiting or connection.inflight > 0 or connection.unacknowledged > 0
 
     def _finish(self) -> None:
         """The connection has ended: nothing more is received, acknowledged or sent on it."""

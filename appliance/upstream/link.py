@@ -375,12 +375,14 @@ class FleetConnection(Generic[T]):
         """
         self._end(Ending(EndedBy.US, code, text, self.granted is None), notify=True)
 
-    def lost(self, text: str) -> None:
-        """The network has ended the connection."""
+    def lost(self, text: str, *, is_close: bool = False) -> None:
+        """The network has ended the connection; `is_close` if the other end has closed it (FIN)."""
         if self.ended is None and self._protocol.unfinished:
             text += ", inside a packet"
+            is_close = False
         code = ReasonCode.UNSPECIFIED_ERROR
-        self._end(Ending(EndedBy.NETWORK, code, text, self.granted is None), notify=False)
+        ending = Ending(EndedBy.NETWORK, code, text, is_new=self.granted is None, is_close=is_close)
+        self._end(ending, notify=False)
 
     # --- what comes ----------------------------------------------------------------------------
 

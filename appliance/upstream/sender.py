@@ -158,16 +158,18 @@ class Sender:
         if self._patience <= 0:
             self._suspects.clear()
 
-    def end(self, ending: Ending, inflight: Sequence[Entry | None], *, was_settled: bool) -> None:
+    def end(self, ending: Ending, inflight: Sequence[Entry | None], *, was_settled: bool) -> bool:
         """The connection has ended with these messages in flight: they are sent again.
 
         It `was_settled` if the broker had answered all else that it was sent at the beginning.
+        Returns whether one of them may be the reason: it is not the first connection to end on it.
         """
         numbers = [entry.record.number for entry in inflight if entry is not None]
         first = next((entry for entry in inflight if entry is not None), None)
         if first is not None and was_settled and _may_be_poison(ending):
             self._suspect(first, numbers, ending)
         self._backlog.rewind()
+        return first is not None and (bool(self._suspects) or self._stuck >= WITHOUT_PROGRESS)
 
     def _suspect(self, first: Entry, numbers: list[int], ending: Ending) -> None:
         """The broker has closed the connection: perhaps because of one of the messages."""

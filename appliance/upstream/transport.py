@@ -130,6 +130,8 @@ class UpstreamTransport:
         self._is_lost = False
         self._is_over = False  # the owner knows
         self._reason = ""
+        #: The other end has closed the connection (FIN), and not this one.
+        self.was_closed = False
         #: The words for an error that ended the connection.
         self.explain: Callable[[BaseException], str] = str
         self._copy: socket.socket | None = None
@@ -391,6 +393,7 @@ class UpstreamTransport:
             self._lingering.listen()
         if not self._reason:
             self._reason = self._why(exc)
+            self.was_closed = exc is None
         if self._held or self._owner is None:
             self._forget_input()
         self._release()

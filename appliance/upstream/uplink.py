@@ -8,10 +8,8 @@ session for what is sent exist all the time, a `Channel` while a connection does
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -21,25 +19,20 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.meter import Meter
 from appliance.broker.ports import Backlogs
-from appliance.config.urls import ServerUrl, parse_proxy
-from appliance.mqtt.codec import V5, V311, Properties, Property, quote
+from appliance.mqtt.codec import V5, Properties, Property, quote
 from appliance.mqtt.packets import Subscription, Will
-from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.net.layers import LayerScheduler
-from appliance.upstream.agreement import ConnectSettings, EndedBy, Ending
+from appliance.upstream.agreement import ConnectSettings, Ending
 from appliance.upstream.answers import Answers, reply_filter
 from appliance.upstream.backlog import Backlog
-from appliance.upstream.backoff import Backoff
 from appliance.upstream.channel import Channel
-from appliance.upstream.credentials import Credentials, read_credentials
-from appliance.upstream.dial import dial, in_thread
-from appliance.upstream.dial_error import DialError
+from appliance.upstream.credentials import Credentials
 from appliance.upstream.in_session import InCounters, InSession
-from appliance.upstream.limits import KINDS, alpn
+from appliance.upstream.limits import KINDS
+from appliance.upstream.line import AGAIN, Line
 from appliance.upstream.out_session import OutSession
 from appliance.upstream.refusals import (
-    ending_advice,
     reason_words,
     state_advice,
     subscription_advice,
@@ -58,15 +51,6 @@ REPORT_INTERVAL: Final = 10.0
 
 #: Seconds for which the fleet's broker is asked to keep the session of rules with `offline: keep`.
 KEPT_EXPIRY: Final = 7 * 86400
-
-#: The least seconds between two renewals of the login, or looks for a newer token.
-RENEWAL_INTERVAL: Final = 60.0
-
-#: Seconds after a fault of the appliance until what has failed is tried again.
-AGAIN: Final = 1.0
-
-#: Seconds that the stop waits for a dial to be cancelled, at a time.
-CANCEL_TIMEOUT: Final = 2.0
 
 #: What CONNECT announces. Explicitly, because mosquitto otherwise has no more than 20 messages in
 #: flight; and so large, because mosquitto exceeds a smaller one when a session is resumed. What is
@@ -121,9 +105,9 @@ class Uplink:
             self._offer_later,
         )
         self._in_counters = InCounters()
-        self._lines = [_Line(self, is_kept=False)]
+        self._lines = [Line(self, is_kept=False)]
         if any(rule.offline == "keep" for rule in settings.inward):
-            self._lines.append(_Line(self, is_kept=True))
+            self._lines.append(Line(self, is_kept=True))
         self._offered, self._sent = Meter(), Meter()
         #: On the present connection: whether the state is still to be published there, and whether
         #: the broker has answered that.
@@ -223,7 +207,7 @@ class Uplink:
             return
         if self._state_due and channel.connection.room:
             self._state_due = False
-            self._publish_state(channel, b"online")
+            self.publish_state(channel, b"online")
         if not self._is_settled:
             return  # so that an end of the connection is not taken for that of a message
         if self._sender.send(channel.connection):
@@ -296,18 +280,20 @@ class Uplink:
     def ended(self, channel: Channel, ending: Ending) -> None:
         """See `ChannelOwner`."""
         line = self._line_of(channel)
+        is_causeless = ending.is_close and channel.is_subscribed
         try:
             if not line.is_kept:
                 inflight = channel.connection.unsettled()
-                self._sender.end(ending, inflight, was_settled=self._is_settled)
+                is_stuck = self._sender.end(ending, inflight, was_settled=self._is_settled)
+                is_causeless = is_causeless and self._is_settled and not is_stuck
         finally:
-            line.on_ended(channel, ending)
+            line.on_ended(ending, is_causeless=is_causeless)
         self._report()
 
-    def _line_of(self, channel: Channel) -> _Line:
+    def _line_of(self, channel: Channel) -> Line:
         return self._lines[channel.is_kept]
 
-    def _publish_state(self, channel: Channel, state: bytes) -> None:
+    def publish_state(self, channel: Channel, state: bytes) -> None:
         """Say there whether the robot is online; the will says when it is not any more."""
         connection = channel.connection
         granted = connection.granted
@@ -321,6 +307,10 @@ class Uplink:
         if not qos:
             self._is_settled = True
 
+    def client_id(self, *, is_kept: bool) -> str:
+        """The client id there of one of the connections."""
+        return self.settings.client_id + ("-keep" if is_kept else "")
+
     def connect_settings(
         self, version: int, credentials: Credentials, *, is_kept: bool
     ) -> ConnectSettings:
@@ -331,7 +321,7 @@ class Uplink:
         if not is_kept:
             will = Will(settings.state_there, b"offline", min(1, limits.qos), limits.retain)
         return ConnectSettings(
-            client_id=settings.client_id + ("-keep" if is_kept else ""),
+            client_id=self.client_id(is_kept=is_kept),
             version=version,
             clean_start=not is_kept,
             session_expiry=KEPT_EXPIRY if is_kept else 0,
@@ -466,195 +456,3 @@ class Uplink:
                 Message(topic, b"1" if status.connected else b"0", 0, True), session
             )
             self.broker.flush()
-
-
-class _Line:
-    """Keeps one of the link's connections: dials, and dials again when it has ended."""
-
-    def __init__(self, link: Uplink, *, is_kept: bool) -> None:
-        self.is_kept = is_kept
-        self.channel: Channel | None = None
-        self.server = ""
-        self.problem: str | None = None
-        self.attempts = 0
-        self.connections = 0
-        self.refused_filters: list[str] = []
-        self._link = link
-        self._settings = link.settings
-        self._loop = link.entries.loop
-        self._version = link.settings.version
-        self._backoff = Backoff(len(link.settings.servers), random.random)
-        self._ending: asyncio.Future[Ending] | None = None
-        self._task: asyncio.Task[None] | None = None
-        self._is_stopping = False
-        #: Set when the next dial is due before its time.
-        self._at_once = asyncio.Event()
-
-    def __str__(self) -> str:
-        return (
-            f"{self._link}, for the rules with offline: keep" if self.is_kept else str(self._link)
-        )
-
-    @property
-    def _client_id(self) -> str:
-        """The client id that it asks for."""
-        return self._settings.client_id + ("-keep" if self.is_kept else "")
-
-    def start(self) -> None:
-        """Begin to dial."""
-        if not self._is_stopping:
-            self._task = self._link.entries.task(
-                "upstream.dial", self._run(), served=self._link, failed=self._start_again
-            )
-
-    def _start_again(self) -> None:
-        """A fault has ended the task: go on a little later."""
-        self._link.entries.later("upstream.restart", AGAIN, self.start, failed=self._start_again)
-
-    async def stop(self) -> None:
-        """Disconnect, and dial no more."""
-        self._is_stopping = True
-        channel = self.channel
-        if channel is not None and channel.connection.granted is not None and not self.is_kept:
-            self._link._publish_state(channel, b"offline")
-        if channel is not None:
-            channel.close(ReasonCode.SUCCESS, "the appliance stops")
-        task = self._task
-        while task is not None and not task.done():
-            task.cancel()
-            await asyncio.wait({task}, timeout=CANCEL_TIMEOUT)
-
-    async def _run(self) -> None:
-        while True:
-            wait = await self._attempt()
-            self._at_once.clear()
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._at_once.wait(), wait)
-
-    async def _attempt(self) -> float:
-        """One connection, from its dial to its end; returns the seconds until the next."""
-        link, settings = self._link, self._settings
-        server = settings.servers[self._backoff.server]
-        self.server = str(server)
-        self.attempts += 1
-        try:
-            login = settings.login
-            credentials = await in_thread(link.entries, partial(read_credentials, login))
-            tls = replace(
-                settings.tls,
-                alpn=tuple(
-                    alpn(settings.kind, server.port, settings.tls.alpn, login.username is not None)
-                ),
-            )
-            proxy = None if settings.proxy is None else parse_proxy(settings.proxy)
-            transport = await dial(server, tls, proxy, link.surroundings())
-        except (DialError, OSError, RuntimeError, ValueError) as error:
-            return self._failed(str(error))
-        channel = Channel(
-            link,
-            link.connect_settings(self._version, credentials, is_kept=self.is_kept),
-            link.subscriptions(self._version, is_kept=self.is_kept),
-            link.least_late(is_kept=self.is_kept),
-            is_kept=self.is_kept,
-        )
-        self.channel = channel
-        self._ending = self._loop.create_future()
-        try:
-            channel.begin(transport)
-            ending = await self._until_end(credentials)
-        finally:
-            code = (
-                ReasonCode.SUCCESS
-                if self._is_stopping
-                else (ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR)
-            )
-            channel.close(code, "the appliance stops")
-            self.channel = None
-            transport.close("the appliance stops")
-        return self._after(ending, server)
-
-    async def _until_end(self, credentials: Credentials) -> Ending:
-        """Wait for the end; a login that expires is renewed before it does."""
-        ending = self._ending
-        assert ending is not None
-        channel = self.channel
-        assert channel is not None
-        look_in = credentials.renew_in()
-        while True:
-            done, _ = await asyncio.wait({ending}, timeout=look_in)
-            if done:
-                return ending.result()
-            look_in = RENEWAL_INTERVAL
-            try:
-                newer = await in_thread(
-                    self._link.entries, partial(read_credentials, self._settings.login)
-                )
-            except (OSError, ValueError, RuntimeError) as error:
-                self._report_problem(str(error), 0.0)
-                continue
-            if newer.has_same_secret(credentials):
-                self._report_problem("the token expires, and its file has no newer one", 0.0)
-                continue
-            credentials = newer
-            look_in = max(RENEWAL_INTERVAL, newer.renew_in() or 0.0)
-            channel.renew_login(newer.data)
-
-    def clock_was_set(self) -> None:
-        """Dial at once."""
-        self._backoff.clock_was_set()
-        self._at_once.set()
-
-    def on_opened(self, channel: Channel) -> None:
-        """CONNACK has come."""
-        self._backoff.connected(self._loop.time())
-        self.connections += 1
-        self.problem = None
-        log.info("%s: connected to %s as %s", self, self.server, quote(channel.client_id))
-
-    def on_ended(self, channel: Channel, ending: Ending) -> None:
-        """The connection has ended."""
-        self.channel = None
-        if self._ending is not None and not self._ending.done():
-            self._ending.set_result(ending)
-
-    def _after(self, ending: Ending, server: ServerUrl) -> float:
-        now = self._loop.time()
-        if ending.refuses_version and self._version == V5:
-            return self._fall_back()
-        if ending.code == ReasonCode.SESSION_TAKEN_OVER and ending.by is EndedBy.BROKER:
-            wait = self._backoff.taken_over(now)
-            text = ending.text
-            if self._backoff.is_contested(now):
-                text = (
-                    f"another client has the client id {quote(self._client_id)} as well, and takes "
-                    f"the connection over again and again (waiting {wait:.0f} s); each needs a "
-                    "client_id of its own"
-                )
-            return self._report_problem(text, wait)
-        if ending.by is EndedBy.US and ending.code < 0x80:
-            return 0.0
-        advice = ending_advice(ending, self._settings, server, self._client_id)
-        return self._failed(f"{ending.text}; {advice}" if advice else ending.text)
-
-    def _fall_back(self) -> float:
-        """The broker does not know MQTT 5."""
-        overlapping = self._settings.overlapping()
-        if overlapping:
-            out, inward = overlapping[0]
-            return self._failed(
-                "the broker does not know MQTT 5, and with 3.1.1 the rules for "
-                f"{quote(out.local_filter)} and {quote(inward.remote_filter)} would send messages "
-                "in a circle"
-            )
-        self._version = V311
-        log.info("%s: %s does not know MQTT 5, going on with 3.1.1", self, self.server)
-        return 0.0
-
-    def _failed(self, problem: str) -> float:
-        return self._report_problem(problem, self._backoff.failed(self._loop.time()))
-
-    def _report_problem(self, problem: str, wait: float) -> float:
-        if problem != self.problem:
-            self.problem = problem
-            log.warning("%s: %s as %s: %s", self, self.server, quote(self._client_id), problem)
-        return wait

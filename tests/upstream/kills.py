@@ -13,8 +13,8 @@ from typing import Any, Literal
 from appliance_process import ApplianceProcess
 
 from upstream import account
-from upstream.device import HERE, THERE, ApplianceDevice, BridgeDevice, Device
-from upstream.peers import PASSWORD, USER, Ejabberd, FleetMosquitto, RabbitMQ
+from upstream.device import HERE, IN, THERE, ApplianceDevice, BridgeDevice, Device
+from upstream.peers import HOST, PASSWORD, USER, Ejabberd, FleetMosquitto, RabbitMQ
 from upstream.relay import Relay
 from upstream.streams import Member, Side, Sink, Source, version_of
 
@@ -70,7 +70,10 @@ def make_device(kind: str, directory: Path, remote: int, fleet: Fleet, window: i
     if kind.startswith("mosquitto"):
         version = "mqttv311" if kind.endswith("311") else "mqttv50"
         return BridgeDevice(directory, remote, window=window, version=version)
-    link: dict[str, Any] = {"kind": "rabbitmq", "version": "3.1.1"} if fleet == "rabbitmq" else {}
+    link: dict[str, Any] = {}
+    if fleet == "rabbitmq":
+        # In 3.1.1 what is received must not overlap with what is sent: no `+/_call`.
+        link = {"kind": "rabbitmq", "version": "3.1.1", "in": [dict(rule) for rule in IN[:2]]}
     return ApplianceDevice(directory, remote, window=window, link=link)
 
 
@@ -231,6 +234,8 @@ class Kills:
         self.killed_at.append(time.monotonic())
         await asyncio.gather(*work)
         self.report.kills += 1
+        # An appliance has another port after each start.
+        self.relay.target = (HOST, self.fleet.plain_port)
         self.here.up.set()
         self.there.up.set()
         await self._until(

@@ -7,6 +7,7 @@ import random
 from appliance.upstream.backoff import (
     LASTED,
     LONGEST,
+    LONGEST_RETURN,
     RETURN_AFTER,
     SHORTEST,
     Backoff,
@@ -81,6 +82,50 @@ def test_a_connection_that_is_lost_after_five_minutes_is_followed_by_the_first_s
     backoff.connected(1)
     backoff.failed(RETURN_AFTER + 1)
     assert backoff.server == 0 and backoff.return_at is None
+
+
+def test_a_first_server_that_answers_and_accepts_nothing_is_returned_to_less_and_less_often():
+    backoff = Backoff(2, lambda: 1.0)
+    now = 0.0
+    backoff.failed(now)
+    intervals = []
+    for _ in range(6):
+        backoff.connected(now)
+        assert backoff.server == 1 and backoff.return_at is not None
+        intervals.append(backoff.return_at - now)
+        now = backoff.return_at
+        backoff.returned(now)
+        backoff.failed(now)
+    assert intervals == [300, 600, 1200, 2400, LONGEST_RETURN, LONGEST_RETURN]
+    now = backoff.return_at or 0
+    backoff.returned(now)
+    backoff.connected(now)
+    backoff.failed(now + LASTED)  # a connection has lasted
+    backoff.failed(now + LASTED)
+    assert backoff.server == 1 and backoff.return_at == now + LASTED + RETURN_AFTER
+
+
+def test_who_is_closed_on_three_times_a_minute_waits_for_a_minute():
+    """As by mosquitto 2.0 when another client takes the client id over."""
+    backoff = Backoff(1, lambda: 0.5)
+    for now in (0, 20, 40):
+        assert not backoff.is_contested(now)
+        backoff.connected(now)
+        wait = backoff.closed(now + 1)
+    assert wait == LONGEST and backoff.is_contested(41)
+    backoff.connected(101)
+    assert backoff.closed(102) < LONGEST  # the third within a longer time
+
+
+def test_closes_after_a_long_time_or_of_a_server_that_is_away_between_are_no_takeovers():
+    backoff = Backoff(1, lambda: 0.5)
+    for now in (0, LASTED, 2 * LASTED, 3 * LASTED):
+        backoff.connected(now)
+        assert backoff.closed(now + LASTED) == 0.5 * SHORTEST
+    for now in (1000, 1010, 1020, 1030):
+        backoff.connected(now)
+        assert backoff.closed(now + 1) < LONGEST
+        backoff.failed(now + 2)  # it is started again
 
 
 def test_who_is_taken_over_three_times_a_minute_waits_for_a_minute():

@@ -10,7 +10,7 @@ from saboteur import Saboteur
 from waiting import until
 
 from appliance.mqtt.packets import Publish
-from appliance.upstream import channel, uplink
+from appliance.upstream import channel, line, uplink
 from upstream.fake_fleet import FakeFleet
 from upstream.uplink_rig import Rig, hurry, running
 from upstream.uplink_rig import event_loop_policy as event_loop_policy
@@ -83,7 +83,12 @@ async def test_the_link_goes_on(
     behind: bool,
 ) -> None:
     hurry(monkeypatch)
-    for module, constant in ((uplink, "TICK"), (uplink, "AGAIN"), (channel, "CHECK_INTERVAL")):
+    for module, constant in (
+        (uplink, "TICK"),
+        (uplink, "AGAIN"),
+        (line, "AGAIN"),
+        (channel, "CHECK_INTERVAL"),
+    ):
         monkeypatch.setattr(module, constant, 0.1)
     saboteur = Saboteur(monkeypatch)
     rules = [{"topic": "cmd/#", "late": "500 ms"}]
