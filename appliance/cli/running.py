@@ -46,7 +46,7 @@ def init(
     from appliance.certs import CertificateError
     from appliance.config import ConfigError
     from appliance.host.owners import OwnerError, acting_for
-    from appliance.ops.init import Credentials, InitError, InitStep, initialise
+    from appliance.ops.init import Credentials, InitError, InitStep, NextSteps, initialise
 
     try:
         with acting_for(directory / "appliance.yaml"):
@@ -63,6 +63,10 @@ def init(
                         "This is the only time that it is shown.\n",
                         bold=True,
                     )
+                elif isinstance(step, NextSteps):
+                    typer.echo("Next:")
+                    for number, text in enumerate(step.texts, 1):
+                        typer.echo(f"{number}. {text}")
     except (AccessFileError, CertificateError, ConfigError, InitError, OwnerError) as error:
         raise CommandError(str(error)) from None
 

@@ -19,7 +19,8 @@ upstreams:
   - name: {name}
     servers: ["{server}"]
 {login}    out:
-      - {{topic: "events/#"}}              # {{robot}}/events/… here
+      - {{topic: "events/#"}}              # {{robot}}/events/… here: whoever publishes them needs
+                                         # a line such as: topic write {{robot}}/events/#
       - {{topic: _appliance/routes}}       # what is bridged
     in: []
     # What may come from there; for this, the access rules need: topic write {{robot}}/cmd_vel
@@ -39,6 +40,12 @@ topic write {{robot}}/_upstream/{name}/#
 """
 
 
+#: What the first user may do, so that there is something to send from the first minute.
+FIRST_USER_RULES = """# What the link to the fleet's broker sends.
+topic write {robot}/events/#
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class FirstLink:
     """A link to be added: the text of its section, and of the rules of its user.
@@ -51,6 +58,17 @@ class FirstLink:
     rules: str
     username: str | None = None
     password_file: str | None = None
+
+    def next_steps(self, robot: str) -> list[str]:
+        """What is to be done before the first message arrives there."""
+        steps = []
+        if self.password_file is not None:
+            steps.append(f"put the password into {self.password_file}")
+        who = "this client" if self.username is None else f"the user {self.username}"
+        steps.append(f"let {who} read and write fleet/{robot}/# at {self.server.host}")
+        steps.append("appliance check, then appliance run, then appliance upstream")
+        steps.append(f"what is published at {robot}/events/test is at fleet/{robot}/events/test")
+        return steps
 
 
 def parse_first_link(url: str) -> FirstLink:

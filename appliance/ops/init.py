@@ -19,7 +19,12 @@ from appliance import certs, config
 from appliance.access import Acl, Passwords, check_username
 from appliance.config import ConfigError
 from appliance.host.environment import of_service
-from appliance.ops.first_link import LINK_USER, FirstLink, parse_first_link
+from appliance.ops.first_link import (
+    FIRST_USER_RULES,
+    LINK_USER,
+    FirstLink,
+    parse_first_link,
+)
 
 PASSWORD_FILE = "user.password"
 _PASSWORD_LENGTH = 20  # of 62 characters each: 119 bits
@@ -101,6 +106,13 @@ class InitStep:
 
 
 @dataclass(frozen=True)
+class NextSteps:
+    """What a person does next."""
+
+    texts: list[str]
+
+
+@dataclass(frozen=True)
 class Credentials:
     """The first user, with the password, which is shown only once."""
 
@@ -129,7 +141,7 @@ def initialise(
     configuration: str = CONFIGURATION,
     names: Sequence[str] = (),
     upstream: str | None = None,
-) -> Iterator[InitStep | Credentials]:
+) -> Iterator[InitStep | Credentials | NextSteps]:
     """Create what is missing in `directory`, and yield each step when it is done.
 
     `configuration` is the text for a missing appliance.yaml, with `{robot}` in it; `names` are DNS
@@ -158,12 +170,15 @@ def initialise(
     yield InitStep(file, made, f"configuration of robot {settings.robot!r}")
     yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
-    made = _write_new(settings.broker.acl, ACCESS.format(user=user, calls=calls or NO_CALLS))
+    rules = ACCESS.format(user=user, calls=calls or NO_CALLS)
+    made = _write_new(settings.broker.acl, rules + (FIRST_USER_RULES if first else ""))
     yield InitStep(settings.broker.acl, made, "access rules")
     if first is not None:
         yield from _link(settings, file, first)
     # The users come last, so that the password is the last thing shown.
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
+    if first is not None:
+        yield NextSteps(first.next_steps(settings.robot))
 
 
 def call_topics(bridge: config.BridgeSection) -> list[str]:

@@ -370,7 +370,7 @@ class ServiceInstaller:
             if isinstance(step, InitStep):
                 shown = "/" / step.path.relative_to(self.root)
                 yield InstallStep("made" if step.made else "kept", str(shown), step.text)
-            else:
+            elif isinstance(step, Credentials):
                 yield step
         _hand_over(place, account, before)
 

@@ -13,6 +13,9 @@ from appliance.ops.check import Finding, check
 from appliance.ops.init import initialise
 
 RULES = """\
+user alice
+topic write {robot}/#
+topic write x/#
 user upstream
 topic read {robot}/events/#
 topic write {robot}/cmd_vel
@@ -244,7 +247,9 @@ def test_missing_rights_are_told_with_the_line_to_add(here: Path) -> None:
 
 
 def test_rights_that_are_denied(here: Path) -> None:
-    (here / "acl.conf").write_text("user upstream\ntopic {robot}/#\ntopic deny {robot}/events/#\n")
+    (here / "acl.conf").write_text(
+        "user alice\ntopic {robot}/#\nuser upstream\ntopic {robot}/#\ntopic deny {robot}/events/#\n"
+    )
     (told,) = troubles(here)
     assert "out events/#: no rule lets the user 'upstream' read r2/events/#" in told
     assert troubles(here, out=[{"topic": "#"}]) == []
@@ -295,3 +300,39 @@ def test_rules_that_need_mqtt_5(here: Path) -> None:
     keys: dict[str, Any] = {"out": [{"topic": "events/#"}], "in_": [{"topic": "events/x"}]}
     told = [each.text for each in found(here, **keys)]
     assert any("does not fall back to 3.1.1" in each for each in told)
+
+
+@pytest.mark.parametrize(
+    ("rules", "words"),
+    [
+        ({"out": [{"topic": "#"}, {"topic": "events/#"}]}, "out events/#: never used, as out #"),
+        ({"out": [{"topic": "a/#"}, {"topic": "a"}]}, "out a: never used"),
+        ({"in_": [{"topic": "+"}, {"topic": "cmd_vel"}]}, "in cmd_vel: never used, as in +"),
+        (
+            {"in_": [{"topic": "cmd_vel"}, {"topic": "#", "offline": "keep"}]},
+            "their messages come twice",
+        ),
+        ({"out": [{"topic": "r2/events/#"}]}, "twice, as in r2/r2/events/#"),
+        ({"out": [{"topic": "_appliance/state"}]}, "no rule carries r2/_appliance/state"),
+        ({"in_": [{"topic": "_appliance/x"}]}, "no rule carries fleet/r2/_appliance/x"),
+        ({"out": [{"topic": "lamp", "local_prefix": "cell/"}]}, "nobody publishes cell/lamp here"),
+        (
+            {"in_": [{"topic": "reset/_call"}]},
+            "nothing that is bridged is called at r2/reset/_call",
+        ),
+        ({"in_": [{"topic": "cmd_vel", "late": "80 ms"}]}, "late 80 ms cannot be kept"),
+    ],
+)
+def test_rules_that_cannot_do_what_they_say(here: Path, rules: dict[str, Any], words: str) -> None:
+    with (here / "acl.conf").open("a") as file:
+        file.write("topic readwrite {robot}/#\ntopic readwrite cell/#\n")
+    told = [each for each in troubles(here, **rules) if words in each]
+    assert len(told) == 1
+
+
+def test_rules_that_share_topics_in_a_useful_order(here: Path) -> None:
+    with (here / "acl.conf").open("a") as file:
+        file.write("topic readwrite {robot}/#\n")
+    rules = [{"topic": "events/door", "keep": "latest"}, {"topic": "events/+"}, {"topic": "#"}]
+    moved = {"topic": "#", "local_prefix": "", "remote_prefix": "all/"}
+    assert troubles(here, out=[*rules, moved]) == []

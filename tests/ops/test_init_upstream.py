@@ -46,6 +46,7 @@ def test_a_new_appliance_with_a_link(tmp_path: Path) -> None:
     assert link.servers == (ServerUrl("mqtts", "broker.example", 8883),)
     assert (link.name, link.kind, link.prefix) == ("fleet", "generic", "fleet/r2/")
     acl = Acl.load(tmp_path / "acl.conf", "r2")
+    assert acl.decide(Identity("operator", "a"), Action.PUBLISH, "r2/events/test")
     out, inward = (
         Identity("upstream", "_upstream/fleet"),
         Identity("upstream", "_upstream/fleet/in"),
@@ -88,7 +89,8 @@ def test_a_link_is_added_to_what_there_is(tmp_path: Path) -> None:
     assert acl.read_text().startswith("user operator\ntopic read x\n")
     assert Acl.load(acl, "r2").decide(Identity("operator", "b"), Action.RECEIVE, "x")
     assert stat.S_IMODE(file.stat().st_mode) == 0o640
-    assert troubles(tmp_path) == []
+    (text,) = troubles(tmp_path)  # in somebody's own rules nobody is given a right
+    assert text.endswith("below the line of the user that does: topic write {robot}/events/#")
 
 
 def test_a_second_time_nothing_is_added(tmp_path: Path) -> None:
@@ -104,9 +106,10 @@ def test_a_second_time_nothing_is_added(tmp_path: Path) -> None:
 
 def test_rules_of_the_links_user_are_kept(tmp_path: Path) -> None:
     list(initialise(tmp_path, robot="r2"))
-    (tmp_path / "acl.conf").write_text("user upstream\ntopic read {robot}/#\n")
+    rules = "user operator\ntopic write {robot}/#\nuser upstream\ntopic read {robot}/#\n"
+    (tmp_path / "acl.conf").write_text(rules)
     assert not add(tmp_path)["acl.conf: access rules of the link's user, upstream"]
-    assert (tmp_path / "acl.conf").read_text() == "user upstream\ntopic read {robot}/#\n"
+    assert (tmp_path / "acl.conf").read_text() == rules
     assert troubles(tmp_path) == []
 
 
@@ -163,7 +166,9 @@ def test_it_is_an_option_of_the_command(tmp_path: Path, capsys: pytest.CaptureFi
     with pytest.raises(SystemExit) as ended:
         cli.main([*arguments, URL])
     assert ended.value.code == 0
-    assert "the link to mqtts://broker.example:8883" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "the link to mqtts://broker.example:8883" in told
+    assert "published at r2/events/test is at fleet/r2/events/test" in told
     with pytest.raises(SystemExit) as ended:
         cli.main([*arguments, "foo"])
     assert ended.value.code == 1

@@ -16,6 +16,7 @@ from appliance.broker.ports import Action, Identity
 from appliance.config import Settings, TopicRoute, format_duration, format_size
 from appliance.mqtt.codec import V5
 from appliance.mqtt.topics import overlaps
+from appliance.ops.check.link_rules import link_rules
 from appliance.ops.check.rights import written
 from appliance.ops.finding import Finding
 from appliance.ops.init import call_topics
@@ -44,6 +45,7 @@ def upstreams(settings: Settings) -> Iterator[Finding]:
         yield from _kind(settings, link)
         if acl is not None:
             yield from _rights(settings, link, acl)
+        yield from link_rules(settings, link, acl)
         yield from _commands(settings, link)
     if settings.robot == _DEFAULT_ROBOT:
         text = (
