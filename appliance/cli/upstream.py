@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Iterator
+from typing import Annotated, Any, Final
 
 import typer
 
 from appliance.cli.console import CommandError, ConfigOption, load, print_table
 
 HEAD = ("NAME", "SERVER", "STATE", "WAITING", "BYTES", "OLDEST", "DROPPED", "ASIDE", "MS")
+
+#: Of messages of which only the latest of a topic counts: the older ones are not lost.
+REPLACED: Final = "replaced"
 
 
 def upstream(
@@ -30,28 +34,42 @@ def upstream(
     if not links:
         typer.echo("there is no link to a fleet's broker (upstreams in appliance.yaml)")
         return
+    print_table([HEAD, *map(_row, links)])
+    for number, (name, is_warning, text) in enumerate(details(links)):
+        if not number:
+            typer.echo()
+        typer.secho(f"{name}: ", fg="yellow" if is_warning else None, nl=False)
+        typer.echo(text.translate(VISIBLE))
+
+
+def details(links: list[dict[str, Any]]) -> Iterator[tuple[str, bool, str]]:
+    """What a person should know of the links: the name of one, whether it is a warning, the text.
+
+    The fleet's broker says a part of it: the caller makes control characters visible.
+    """
     from appliance.upstream.status import warnings_of
 
-    print_table([HEAD, *map(_row, links)])
     for link in links:
+        name = link["name"]
         for text in warnings_of(link):
-            typer.secho(f"\n{link['name']}: ", fg="yellow", nl=False)
-            typer.echo(text.translate(VISIBLE), nl=False)
+            yield name, True, text
         for rule, reasons in link["dropped"].items():
             counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-            typer.echo(
-                f"\n{link['name']}: dropped of {rule}: {counts}".translate(VISIBLE), nl=False
-            )
+            lost = any(reason != REPLACED for reason in reasons)
+            yield name, False, f"{'dropped' if lost else 'not sent'} of {rule}: {counts}"
         for each in link["aside"]:
-            text = f"\n{link['name']}: set aside, {each['topic']}: {each['reason']}"
-            typer.echo(text.translate(VISIBLE), nl=False)
-    typer.echo()
+            yield name, False, f"set aside, {each['topic']}: {each['reason']}"
 
 
 def _row(link: dict[str, Any]) -> tuple[str, ...]:
     from appliance.config import about_size
 
-    dropped = sum(sum(reasons.values()) for reasons in link["dropped"].values())
+    dropped = sum(
+        count
+        for reasons in link["dropped"].values()
+        for reason, count in reasons.items()
+        if reason != REPLACED
+    )
     trip = link["round_trip"]
     return (
         link["name"],

@@ -498,8 +498,10 @@ class InSession:
         self._connection.acknowledge(packet_id, code)
 
     def abandon(self) -> None:
-        """AckLink: what was to be acknowledged could not be stored."""
-        self._close(ReasonCode.UNSPECIFIED_ERROR, CANNOT_KEEP)
+        """AckLink: what was to be acknowledged could not be stored, or a fault kept it back."""
+        is_failing = self._broker.accounting.failing
+        fault = "a fault in the appliance; its log has it"
+        self._close(ReasonCode.UNSPECIFIED_ERROR, CANNOT_KEEP if is_failing else fault)
 
     def _close(self, code: ReasonCode, reason: str) -> None:
         self._acknowledgements.close()

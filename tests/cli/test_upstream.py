@@ -1,0 +1,45 @@
+"""`appliance upstream`: what it prints of links."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import yaml
+
+from appliance.cli import main as cli
+from appliance.ops import control
+from appliance.upstream.backlog import DropReason
+from appliance.upstream.status import LinkStatus
+
+LINK = LinkStatus(
+    "fleet",
+    "generic",
+    server="mqtts://a:8883",
+    problem="it says\nwhat\x1b[2J",
+    dropped={
+        "r2/state/#": {DropReason.REPLACED.value: 900},
+        "r2/events/#": {DropReason.REPLACED.value: 50, DropReason.FULL.value: 3},
+    },
+)
+ASIDE = {"rule": "r2/events/#", "topic": "t", "size": 1, "reason": "no\nway", "age": 1.0}
+
+
+def test_each_thing_to_know_is_a_line_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "appliance.yaml").write_text(yaml.safe_dump({"robot": "r2"}))
+    links = [{**asdict(LINK), "aside": [ASIDE]}]
+    monkeypatch.setattr(control, "ask", lambda *_: links)
+    with pytest.raises(SystemExit):
+        cli.main(["upstream", "-c", str(tmp_path / "appliance.yaml")])
+    head, row, *lines = capsys.readouterr().out.splitlines()
+    assert row[head.index("DROPPED") :].split()[0] == "3"  # what was replaced is not lost
+    assert lines == [
+        "",
+        r"fleet: it says\x0awhat\x1b[2J",
+        "fleet: not sent of r2/state/#: 900 replaced",
+        "fleet: dropped of r2/events/#: 50 replaced, 3 full",
+        r"fleet: set aside, t: no\x0away",
+    ]
