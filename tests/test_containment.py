@@ -28,6 +28,7 @@ import yaml
 from amqtt.plugins.base import BasePlugin
 from harness import Harness, Peer, check_scheduler, make_contexts
 from saboteur import INLINE, SabotageError, Saboteur, all_entries, owner_of
+from upstream import test_dial, test_uplink_contained
 from waiting import PATIENCE, until
 
 from appliance import config
@@ -866,35 +867,8 @@ ELSEWHERE = {
         ),
         "ros/ros2/test_ros2_contained.py",
     ),
-    **dict.fromkeys(
-        (
-            "upstream.check",
-            "upstream.clock",
-            "upstream.dial",
-            "upstream.offer",
-            "upstream.ping",
-            "upstream.restart",
-            "upstream.send",
-            "upstream.turn",
-        ),
-        "upstream/test_uplink_contained.py",
-    ),
-    **dict.fromkeys(
-        (
-            "dial.abandoned",
-            "dial.step",
-            "dial.thread",
-            "upstream.chunk",
-            "upstream.cut",
-            "upstream.eof",
-            "upstream.look",
-            "upstream.lost",
-            "upstream.made",
-            "upstream.pause",
-            "upstream.resume",
-        ),
-        "upstream/test_dial.py",
-    ),
+    **dict.fromkeys(test_uplink_contained.ENTRIES, "upstream/test_uplink_contained.py"),
+    **dict.fromkeys(test_dial.ENTRIES, "upstream/test_dial.py"),
     "upstream.return": "upstream/test_servers.py",
     "stop.session": "test_containment.py",
     "store.read": "store/test_memory_backlogs.py",

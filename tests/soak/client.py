@@ -257,16 +257,21 @@ class Client:
 
     async def _expect_end(self, wire: Wire) -> None:
         """The broker has to end a connection that was taken over, and to say so in MQTT 5."""
+        closed = await self._is_closed(wire, "take-over", "the old connection is still there after")
+        expected = ReasonCode.SESSION_TAKEN_OVER if self.profile.version == V5 else wire.reason
+        if closed and wire.reason != expected:
+            self.wrong("take-over", f"the old connection ended with {wire.reason!r}")
+
+    async def _is_closed(self, wire: Wire, kind: str, otherwise: str) -> bool:
+        """Whether the broker closes it in time; else that is a fault, and it is cut."""
         wire.resume()
         try:
             await asyncio.wait_for(wire.closed.wait(), PATIENCE)
         except asyncio.TimeoutError:
-            self.wrong("take-over", f"the old connection is still there after {PATIENCE:g} s")
+            self.wrong(kind, f"{otherwise} {PATIENCE:g} s")
             wire.cut(reset=True)
-            return
-        taken_over = ReasonCode.SESSION_TAKEN_OVER
-        if self.profile.version == V5 and wire.reason != taken_over:
-            self.wrong("take-over", f"the old connection ended with {wire.reason!r}")
+            return False
+        return True
 
     def _in_background(self, work: Coroutine[object, object, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -317,12 +322,7 @@ class Client:
         self.send(packet)
         due = packet.reason_code != ReasonCode.NORMAL_DISCONNECTION
         self._leave(f"{packet} expiry={expiry}", will="due" if due else "dropped")
-        wire.resume()
-        try:
-            await asyncio.wait_for(wire.closed.wait(), PATIENCE)
-        except asyncio.TimeoutError:
-            self.wrong("no answer", f"not closed within {PATIENCE:g} s after DISCONNECT")
-            wire.cut(reset=True)
+        await self._is_closed(wire, "no answer", "not closed after DISCONNECT and")
         if self._left is not None:  # the broker may have seen it only now
             self._left = (self._left[0], self.model.clock())
 

@@ -47,7 +47,7 @@ from upstream.peers import PASSWORD, USER, FleetMosquitto, Tinyproxy, free_ports
 
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
-#: The entries that this lets fail, see test_containment.py.
+#: The entries that this lets fail; test_containment.py counts on it.
 ENTRIES = (
     "dial.abandoned",
     "dial.step",

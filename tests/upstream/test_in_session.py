@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from broker.conftest import FakeStore, lasting
+from broker.conftest import FakeStore, Peer, lasting
 from waiting import until
 
 from appliance.broker.message import Message
@@ -402,7 +402,21 @@ async def test_a_real_store_holds_acknowledgements_back(tmp_path: Path) -> None:
 
 # --- receivers without room --------------------------------------------------------------------
 
-SMALL = Limits(queue_messages=10, inflight=5)
+
+@pytest.fixture
+def small(tmp_path: Path) -> Rig:
+    """With little room for messages that wait."""
+    rig = Rig(tmp_path, limits=Limits(queue_messages=10, inflight=5))
+    rig.begin()
+    return rig
+
+
+def crowded(rig: Rig) -> tuple[Peer, Fleet, int]:
+    """A reader that does not read, for whom one message waits; the last is how many did not."""
+    reader = rig.join("reader")
+    reader.subscribe("r2/mission/#", 1)
+    fleet = rig.connect()
+    return reader, fleet, crowd(rig, fleet)
 
 
 def crowd(rig: Rig, fleet: Fleet) -> int:
@@ -415,15 +429,11 @@ def crowd(rig: Rig, fleet: Fleet) -> int:
     raise AssertionError("none waits")
 
 
-def test_a_message_waits_for_its_receivers_and_others_behind_it(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, limits=SMALL)
-    rig.begin()
-    reader = rig.join("reader")
-    reader.subscribe("r2/mission/#", 1)
+def test_a_message_waits_for_its_receivers_and_others_behind_it(small: Rig) -> None:
+    rig = small
     other = rig.join("other")
     other.subscribe("r2/calls/#")
-    fleet = rig.connect()
-    count = crowd(rig, fleet)
+    reader, fleet, count = crowded(rig)
     fleet.put("fleet/r2/calls/1", b"behind")
     rig.broker.flush()
     assert fleet.session.waiting == 2 and not other.messages()
@@ -441,13 +451,8 @@ def test_a_message_waits_for_its_receivers_and_others_behind_it(tmp_path: Path) 
     assert codes == [(count + 1, 0), (count + 2, 0)]
 
 
-def test_a_receiver_that_does_not_read_is_waited_for_for_a_moment(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, limits=SMALL)
-    rig.begin()
-    reader = rig.join("reader")
-    reader.subscribe("r2/mission/#", 1)
-    fleet = rig.connect()
-    count = crowd(rig, fleet)
+def test_a_receiver_that_does_not_read_is_waited_for_for_a_moment(small: Rig) -> None:
+    _, fleet, count = crowded(small)
     fleet.connection.codes()
     waited = 0.0
     while fleet.session.waiting:
@@ -456,20 +461,16 @@ def test_a_receiver_that_does_not_read_is_waited_for_for_a_moment(tmp_path: Path
         fleet.turn(fleet.connection.turn_in)
         assert waited < 5
     assert fleet.connection.codes() == [(count + 1, FULL)]
-    assert rig.counters.refused == 1
+    assert small.counters.refused == 1
     assert fleet.send("fleet/r2/mission/x") == FULL  # nobody waits for it again
 
 
 def test_too_much_that_waits_is_not_read_and_then_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(in_session, "WAITING_MESSAGES", 20)
-    rig = Rig(tmp_path, limits=SMALL)
-    rig.begin()
-    reader = rig.join("reader")
-    reader.subscribe("r2/mission/#", 1)
-    fleet = rig.connect()
-    count = crowd(rig, fleet)
+    rig = small
+    reader, fleet, count = crowded(rig)
     for _ in range(60):  # as in a chunk that has been read already
         fleet.put("fleet/r2/calls/1", b"x" * 1000, qos=1)
         fleet.put("fleet/r2/calls/1", b"x" * 1000, qos=0)
@@ -486,16 +487,10 @@ def test_too_much_that_waits_is_not_read_and_then_refused(
     assert [code for _, code in codes] == [0] * 21 + [FULL] * 40
 
 
-def test_bytes_that_wait_are_limited_as_well(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bytes_that_wait_are_limited_as_well(small: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(in_session, "WAITING_BYTES", 100_000)
-    rig = Rig(tmp_path, limits=SMALL)
-    rig.begin()
-    reader = rig.join("reader")
-    reader.subscribe("r2/mission/#", 1)
-    fleet = rig.connect()
-    crowd(rig, fleet)
+    rig = small
+    reader, fleet, _ = crowded(rig)
     for _ in range(100):
         fleet.put("fleet/r2/calls/1", bytes(10_000))
     assert fleet.connection.is_paused and rig.broker.accounting.input_bytes < 300_000
