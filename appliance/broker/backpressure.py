@@ -26,6 +26,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from appliance.broker.accounting import Accounting
     from appliance.broker.session import Session
 
@@ -68,6 +70,59 @@ class Allowance:
             self.used_up = True
         elif 2 * self.left >= self._most:
             self.used_up = False
+
+
+class PublisherAllowance(Allowance):
+    """The allowance of a publisher, and the congestions that it waits for.
+
+    It does not refer to the publisher, whose memory is to be free as soon as it has ended.
+    """
+
+    __slots__ = ("_reader_time", "_since", "awaited")
+
+    def __init__(self) -> None:
+        super().__init__(PUBLISHER_PATIENCE)
+        self.awaited: Sequence[Congestion] = ()
+        self._since = 0.0
+        self._reader_time = 0.0  # the sum over the awaited congestions at that time
+
+    def wait(self, publisher: Waiting, congestions: Sequence[Congestion], now: float) -> float:
+        """Let it wait for these from now on, and for no others; returns the seconds that it may."""
+        for congestion in self.awaited:
+            if congestion not in congestions:
+                congestion.forget(publisher)
+        self.awaited = congestions
+        self._since = now
+        self._reader_time = sum(congestion.reader_time() for congestion in congestions)
+        seconds = self.left
+        for congestion in congestions:
+            congestion.wait(publisher)
+            seconds = min(seconds, congestion.left)
+        return seconds
+
+    def spend(self, now: float) -> None:
+        """Count the time since `wait`, or since the last call."""
+        if not self.awaited:
+            return
+        reader_time = sum(congestion.reader_time() for congestion in self.awaited)
+        waited = now - self._since
+        # The congestions overlap: together they count no more than the time that it waited.
+        counted = min(max(reader_time - self._reader_time, waited * LEAST_COUNTED), waited)
+        self.change(-counted)
+        self._since, self._reader_time = now, reader_time
+
+    def end_wait(self, publisher: Waiting) -> None:
+        """A message need not wait, or not any longer."""
+        if self.left < PUBLISHER_PATIENCE:
+            self.change(MESSAGE_PATIENCE)
+        if self.awaited:
+            self.stop_waiting(publisher)
+
+    def stop_waiting(self, publisher: Waiting) -> None:
+        """Wait for nobody any more; may be called twice."""
+        for congestion in self.awaited:
+            congestion.forget(publisher)
+        self.awaited = ()
 
 
 class Congestion:

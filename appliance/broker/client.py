@@ -10,16 +10,10 @@ import logging
 import math
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, TypeAlias
 
-from appliance.broker.backpressure import (
-    LEAST_COUNTED,
-    MESSAGE_PATIENCE,
-    PUBLISHER_PATIENCE,
-    Allowance,
-    Congestion,
-)
+from appliance.broker.backpressure import Allowance, PublisherAllowance
 from appliance.broker.broker import DELAYED_AFTER, HELD_COST, Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.handshake import (
@@ -158,16 +152,13 @@ class ClientHandler:
         #: A message that waits for its receivers, and the packets behind it; with arrival times.
         self._behind: deque[tuple[Arrived, float]] = deque()
         self._behind_size = 0  # bytes
-        self._awaited: Sequence[Congestion] = ()
-        self._waits_since = 0.0
-        self._reader_time = 0.0  # the sum over the awaited congestions at that time
         #: The latest possible arrival time of the delayed packet being processed; 0 if not delayed.
         self._arrived_at = 0.0
         #: Since when input waits for a pending decision; 0 when none does.
         self._awaits_since = 0.0
         #: When the first bytes arrived that `protocol` buffers while it is paused; 0 for none.
         self._buffered_since = 0.0
-        self._allowance = Allowance(PUBLISHER_PATIENCE)
+        self._allowance = PublisherAllowance()
         #: The allowance for decisions on which others may receive its messages.
         self._rights_allowance = Allowance(RIGHTS_PATIENCE)
         self._asked_at = 0.0
@@ -476,19 +467,10 @@ class ClientHandler:
         congestions = self.broker.congestions(route, message) if route.allowed else []
         allowance = self._allowance
         if not congestions or allowance.used_up or self._hurries:
-            self._end_wait()
+            allowance.end_wait(self)
             return False
-        self._waits_since = now = self._accounting.now
-        for congestion in self._awaited:
-            if congestion not in congestions:
-                congestion.forget(self)
-        self._awaited = congestions
-        self._reader_time = sum(congestion.reader_time() for congestion in congestions)
-        seconds = allowance.left
-        for congestion in congestions:
-            congestion.wait(self)
-            seconds = min(seconds, congestion.left)
-        self.transport.wait(max(seconds, RECHECK))
+        now = self._accounting.now
+        self.transport.wait(max(allowance.wait(self, congestions, now), RECHECK))
         # It is counted when it is processed again.
         self._counters.publish_received -= 1
         self._counters.publish_bytes_received -= len(message.payload)
@@ -496,18 +478,6 @@ class ClientHandler:
         self._behind_size += _size(arrived)
         self.protocol.pause()
         return True
-
-    def _end_wait(self) -> None:
-        """Note that a message need not wait, or not any longer."""
-        if self._allowance.left < PUBLISHER_PATIENCE:
-            self._allowance.change(MESSAGE_PATIENCE)
-        if self._awaited:
-            self._stop_waiting()
-
-    def _stop_waiting(self) -> None:
-        for congestion in self._awaited:
-            congestion.forget(self)
-        self._awaited = ()
 
     def proceed(self) -> None:
         """A receiver that it waits for has room again."""
@@ -558,13 +528,7 @@ class ClientHandler:
         if not behind:
             return
         limit = self._counters.cost + COST_PER_TURN
-        if self._awaited:
-            reader_time = sum(congestion.reader_time() for congestion in self._awaited)
-            waited = self._accounting.now - self._waits_since
-            # The congestions overlap: together they count no more than the time that it waited.
-            counted = min(max(reader_time - self._reader_time, waited * LEAST_COUNTED), waited)
-            self._allowance.change(-counted)
-            self._waits_since, self._reader_time = self._accounting.now, reader_time
+        self._allowance.spend(self._accounting.now)
         try:
             while behind and self._work is None:
                 if self._counters.cost > limit:
@@ -580,8 +544,8 @@ class ClientHandler:
                     self._on_packet(arrived)
                 if len(behind) > left:
                     break  # it waits again
-                if self._awaited:
-                    self._end_wait()  # without any congestion `_must_wait` was not called
+                if self._allowance.awaited:  # without any congestion `_must_wait` was not called
+                    self._allowance.end_wait(self)
         except ProtocolError as error:
             self.fail(error)
         self._arrived_at = 0.0
@@ -1172,7 +1136,7 @@ class ClientHandler:
             self._accounting.input_bytes -= self._held
             self._held = 0
             self.broker.clients.discard(self)
-            self._stop_waiting()
+            self._allowance.stop_waiting(self)
             self._behind.clear()
             self._behind_size = 0
             self.protocol.close()

@@ -14,17 +14,10 @@ waits, the connection is not read; what comes all the same is refused (0x97).
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, Protocol
 
-from appliance.broker.backpressure import (
-    LEAST_COUNTED,
-    MESSAGE_PATIENCE,
-    PUBLISHER_PATIENCE,
-    Allowance,
-    Congestion,
-)
+from appliance.broker.backpressure import PublisherAllowance
 from appliance.broker.broker import Broker
 from appliance.broker.client import PACKET_COST, RECHECK, RIGHTS_PATIENCE
 from appliance.broker.counters import COST_PER_TURN
@@ -172,11 +165,7 @@ class InSession:
         self._turn_ends = 0
         #: Since when the first one waits for decisions; None when it does not.
         self._undecided_since: float | None = None
-        self._allowance = Allowance(PUBLISHER_PATIENCE)
-        self._awaited: Sequence[Congestion] = ()
-        self._waits_since = 0.0
-        #: The sum over the awaited congestions at that time.
-        self._reader_time = 0.0
+        self._allowance = PublisherAllowance()
 
     def __str__(self) -> str:
         return str(self._session)
@@ -192,7 +181,7 @@ class InSession:
             return
         self._is_detached = True
         self._acknowledgements.close()
-        self._stop_waiting()
+        self._allowance.stop_waiting(self)
         self._waiting.clear()
         self._count(-self._waiting_bytes)
         self._broker.detach(self._session)
@@ -236,7 +225,7 @@ class InSession:
             return
         self._turn_at = -1.0
         self._begin_turn(now)
-        self._count_wait(now)
+        self._allowance.spend(now)
         while self._waiting:
             if self._is_turn_over:
                 self._connection.later(0)
@@ -440,37 +429,10 @@ class InSession:
         broker, allowance = self._broker, self._allowance
         congestions = broker.congestions(route, message) if broker.accounting.congested else []
         if not congestions or allowance.used_up:
-            if allowance.left < PUBLISHER_PATIENCE:
-                allowance.change(MESSAGE_PATIENCE)
-            self._stop_waiting()
+            allowance.end_wait(self)
             return False
-        for congestion in self._awaited:
-            if congestion not in congestions:
-                congestion.forget(self)
-        self._awaited = congestions
-        self._waits_since = broker.now
-        self._reader_time = sum(congestion.reader_time() for congestion in congestions)
-        seconds = allowance.left
-        for congestion in congestions:
-            congestion.wait(self)
-            seconds = min(seconds, congestion.left)
-        self._connection.later(max(seconds, RECHECK))
+        self._connection.later(max(allowance.wait(self, congestions, broker.now), RECHECK))
         return True
-
-    def _count_wait(self, now: float) -> None:
-        """Spend the time for which the first message has waited for its receivers."""
-        if not self._awaited:
-            return
-        reader_time = sum(congestion.reader_time() for congestion in self._awaited)
-        waited = now - self._waits_since
-        counted = min(max(reader_time - self._reader_time, waited * LEAST_COUNTED), waited)
-        self._allowance.change(-counted)
-        self._waits_since, self._reader_time = now, reader_time
-
-    def _stop_waiting(self) -> None:
-        for congestion in self._awaited:
-            congestion.forget(self)
-        self._awaited = ()
 
     # --- acknowledgements ----------------------------------------------------------------------
 

@@ -191,8 +191,8 @@ def test_a_wait_ends_with_the_congestion(join: Join, broker: Broker, rest: float
             reader = join("reader", version=4)
         reader.subscribe("a", 1)
         publisher.send(*(Publish("a", bytes(30_000), 1, False, False, n) for n in range(1, 5)))
-        assert client._awaited, f"burst {burst} was not waited for"
-        congestions = client._awaited
+        assert client._allowance.awaited, f"burst {burst} was not waited for"
+        congestions = client._allowance.awaited
         broker.accounting.now += 0.02
         if ending == "leaves":
             reader.lose()
@@ -202,7 +202,7 @@ def test_a_wait_ends_with_the_congestion(join: Join, broker: Broker, rest: float
         if ending == "reads":
             assert acknowledge_all(reader) == 1, f"burst {burst} lost a message"
         assert len(publisher.received()) == 4
-        assert not client._awaited and not any(each._waiting for each in congestions)
+        assert not client._allowance.awaited and not any(each._waiting for each in congestions)
         assert not broker.accounting.congested
         broker.accounting.now += rest
     assert client._allowance.left > PUBLISHER_PATIENCE / 2

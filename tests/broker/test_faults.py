@@ -9,6 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from appliance.broker.backpressure import PublisherAllowance
 from appliance.broker.broker import Broker
 from appliance.broker.faults import PLACES, Faults
 from appliance.broker.message import Message
@@ -405,7 +406,7 @@ PARTS: list[tuple[Callable[[Broker, Peer], object], str]] = [
     (lambda broker, peer: broker.store, "session_saved"),
     (lambda broker, peer: broker.store, "session_removed"),
     (lambda broker, peer: broker.router, "leave"),
-    (lambda broker, peer: peer.client, "_stop_waiting"),
+    (lambda broker, peer: PublisherAllowance, "stop_waiting"),
     (lambda broker, peer: peer.client.protocol, "close"),
     (lambda broker, peer: peer.client.output, "end"),
 ]
