@@ -40,6 +40,13 @@ def init(
             help="Add a link to the broker of a fleet: mqtts://HOST, or mqtts://USER@HOST.",
         ),
     ] = None,
+    vda5050: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MANUFACTURER",
+            help="The link speaks VDA 5050, as a robot of this manufacturer.",
+        ),
+    ] = None,
 ) -> None:
     """Make certificates, a first user, access rules and appliance.yaml; existing files stay."""
     from appliance.access import AccessFileError
@@ -51,7 +58,13 @@ def init(
     try:
         with acting_for(directory / "appliance.yaml"):
             steps = initialise(
-                directory, robot=robot, user=user, demo=demo, names=name or [], upstream=upstream
+                directory,
+                robot=robot,
+                user=user,
+                demo=demo,
+                names=name or [],
+                upstream=upstream,
+                manufacturer=vda5050,
             )
             for step in steps:
                 if isinstance(step, InitStep):

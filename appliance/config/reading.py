@@ -39,7 +39,7 @@ from appliance.config.settings import (
     UpstreamSection,
 )
 from appliance.config.values import OF_NODE, InListError, ValueEncoding
-from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument
+from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument, dotted
 from appliance.host.environment import of_service
 from appliance.mqtt.topics import check_filter, overlaps
 
@@ -191,6 +191,10 @@ def _cross_check_upstream(
     yield from _cross_check_mapped(settings.robot, upstream)
 
 
+#: The place of the rules that a link's profile adds.
+_PROFILE: KeyPath = ("profile",)
+
+
 #: Why topics at the fleet's broker do not begin with `$`.
 _DOLLAR = "must not begin with '$': those topics are the server's own ($aws/ with kind: aws-iot)"
 
@@ -219,16 +223,17 @@ def _cross_check_mapped(robot: str, upstream: UpstreamSection) -> Iterator[tuple
         "out": upstream.out,
         "in": upstream.inward,
     }
-    there: dict[str, list[str]] = {"out": [], "in": []}
+    there: dict[str, list[tuple[KeyPath, str]]] = {"out": [], "in": []}
     for direction, rules in directions.items():
-        seen: dict[str, int] = {}
-        for number, rule in enumerate(rules):
-            path: KeyPath = (direction, number)
+        seen: dict[str, KeyPath] = {}
+        added = sum(rule.is_added for rule in rules)
+        for number, rule in enumerate(rules, -added):  # as the file numbers them
+            path: KeyPath = (direction, number) if number >= 0 else _PROFILE
             if isinstance(rule, InSection) and rule.offline == "keep" and rule.late is not None:
                 text = "is not for offline: keep: how long the server has queued it nobody says"
                 yield (*path, "late"), text
             filters = rule.local_filter(robot), rule.remote_filter(robot, upstream.prefix)
-            there[direction].append(filters[1])
+            there[direction].append((path, filters[1]))
             problem = _mistake_in_filters(rule, *filters)
             if problem:
                 yield (*path, "topic"), problem
@@ -244,9 +249,9 @@ def _cross_check_mapped(robot: str, upstream: UpstreamSection) -> Iterator[tuple
                 if rule.remote_prefix is not None or not upstream.prefix.startswith("$"):
                     yield (*path, key), _DOLLAR
             read = filters[direction == "in"]
-            first = seen.setdefault(read, number)
-            if first != number:
-                yield (*path, "topic"), f"is the same as in {direction}[{first}], which carries it"
+            first = seen.setdefault(read, path)
+            if first != path:
+                yield (*path, "topic"), f"is the same as in {dotted(first)}, which carries it"
     if upstream.version == "3.1.1":
         yield from _cross_check_loops(there["out"], there["in"])
 
@@ -266,16 +271,18 @@ def _mistake_in_filters(rule: MappedTopicsSection, local: str, remote: str) -> s
     return ""
 
 
-def _cross_check_loops(out: list[str], inward: list[str]) -> Iterator[tuple[KeyPath, str]]:
-    for number, filter in enumerate(inward):
-        for position, other in enumerate(out):
+def _cross_check_loops(
+    out: list[tuple[KeyPath, str]], inward: list[tuple[KeyPath, str]]
+) -> Iterator[tuple[KeyPath, str]]:
+    for path, filter in inward:
+        for position, other in out:
             if _is_filter(filter) and _is_filter(other) and overlaps(filter, other):
                 text = (
-                    f"overlaps out[{position}] at the fleet's broker ({filter} and {other}): what "
-                    "is sent would come back, as MQTT 3.1.1 has no No Local; use "
+                    f"overlaps {dotted(position)} at the fleet's broker ({filter} and {other}): "
+                    "what is sent would come back, as MQTT 3.1.1 has no No Local; use "
                     'version: "5", or topics that share nothing'
                 )
-                yield ("in", number, "topic"), text
+                yield (path if path == _PROFILE else (*path, "topic")), text
 
 
 def _is_filter(text: str) -> bool:
@@ -398,6 +405,7 @@ _EXAMPLES = {
     "clamp": "{linear.x: [-0.5, 0.5]}",
     "on_error": "{success: false}",
     "on_silence": "{after: 500 ms}",
+    "profile": "{vda5050: {manufacturer: acme}}",
     "publish": "{linear: {x: 0}}",
 }
 

@@ -49,6 +49,7 @@ from appliance.config.values import (
     RosNames,
     TlsVersion,
     ValueEncoding,
+    Vda5050Version,
     check_action_type,
     check_allow,
     check_clamp,
@@ -69,8 +70,11 @@ from appliance.config.values import (
     check_service_type,
     check_topic_prefix,
     check_topic_template,
+    check_vda5050_level,
+    check_vda5050_serial_number,
     excludes_only,
     from_names,
+    vda5050_in_full,
 )
 
 if TYPE_CHECKING:
@@ -503,6 +507,12 @@ class MappedTopicsSection(_Section):
     topic: Annotated[str, AfterValidator(check_relative_filter)]
     local_prefix: Annotated[str, AfterValidator(check_topic_prefix)] = "{robot}/"
     remote_prefix: Annotated[str, AfterValidator(check_topic_prefix)] | None = None
+    _is_added: bool = PrivateAttr(default=False)
+
+    @property
+    def is_added(self) -> bool:
+        """Whether the profile of the link has added it, and the file does not have it."""
+        return self._is_added
 
     def local_filter(self, robot: str) -> str:
         """The topic filter here."""
@@ -518,12 +528,20 @@ class MappedTopicsSection(_Section):
         return own.replace("{robot}", robot)
 
 
+MappedT = TypeVar("MappedT", bound=MappedTopicsSection)
+
+
 class OutSection(MappedTopicsSection):
-    """Topics that a link carries to the fleet's broker; `rate` in messages a second."""
+    """Topics that a link carries to the fleet's broker; `rate` in messages a second.
+
+    `qos` is the most, and `retain` takes the place of what the publisher says; None: as it says.
+    """
 
     keep: Literal["auto", "all", "latest", "none"] = "auto"
     priority: Literal["high", "normal", "low"] = "normal"
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    qos: Annotated[int, Field(ge=0, le=1)] | None = None
+    retain: bool | None = None
 
 
 class InSection(MappedTopicsSection):
@@ -531,10 +549,78 @@ class InSection(MappedTopicsSection):
 
     late: Annotated[Duration, Field(gt=0)] | None = None
     offline: Literal["drop", "keep"] = "drop"
+    retained: Literal["take", "drop"] = "take"
+
+
+class Vda5050Section(_Section):
+    """The robot as VDA 5050 names it; `local_prefix` is what its topics have in front here.
+
+    `interface_name` defaults to that of the standard's examples: `uagv`, since 3.0 `vda5050`.
+    """
+
+    version: Vda5050Version = "2.1"
+    manufacturer: Annotated[str, AfterValidator(check_vda5050_level)]
+    serial_number: Annotated[str, AfterValidator(check_vda5050_serial_number)] = "{robot}"
+    interface_name: Annotated[str, AfterValidator(check_vda5050_level)] | None = None
+    local_prefix: Annotated[str, AfterValidator(check_topic_prefix)] = "{robot}/vda5050/"
+
+    @property
+    def major(self) -> int:
+        """The major version, on which topics and states depend."""
+        return int(self.version.partition(".")[0])
+
+    @property
+    def prefix(self) -> str:
+        """What its topics have in front there (2.1 section 6.3, 3.0 section 4.2)."""
+        interface = self.interface_name or ("uagv" if self.major < 3 else "vda5050")
+        return f"{interface}/v{self.major}/{self.manufacturer}/{self.serial_number}/"
+
+    def out(self) -> list[OutSection]:
+        """What the robot says, with QoS 0 (2.1 section 6.2, 3.0 section 4.1).
+
+        Each message says all, so that the latest is enough.
+        """
+        here = self.local_prefix
+        return [
+            OutSection(topic="state", local_prefix=here, keep="latest", qos=0, priority="high"),
+            OutSection(topic="factsheet", local_prefix=here, keep="latest", qos=0, retain=True),
+            OutSection(
+                topic="visualization", local_prefix=here, keep="latest", qos=0, priority="low"
+            ),
+        ]
+
+    def inward(self) -> list[InSection]:
+        """What the robot is told. A retained order would be an old one, and is dropped."""
+        names = ["order", "instantActions", *(["zoneSet", "responses"] if self.major >= 3 else [])]
+        return [
+            InSection(topic=each, local_prefix=self.local_prefix, retained="drop") for each in names
+        ]
+
+
+class ProfileSection(_Section):
+    """A standard that a link speaks: its topics, and how it says that the robot is online."""
+
+    vda5050: Vda5050Section
+
+
+def _vda5050_of(info: ValidationInfo) -> Vda5050Section | None:
+    """The profile of the link whose later keys are validated; None too where it is invalid."""
+    profile = info.data.get("profile")
+    return None if profile is None else profile.vda5050
+
+
+def _default_prefix(value: object, info: ValidationInfo) -> object:
+    if value is not None:
+        return value
+    vda5050 = _vda5050_of(info)
+    return "fleet/{robot}/" if vda5050 is None else vda5050.prefix
 
 
 class UpstreamSection(_Section):
-    """A link to a fleet's broker; `rate` in messages a second, `keep_alive` in seconds."""
+    """A link to a fleet's broker; `rate` in messages a second, `keep_alive` in seconds.
+
+    A profile is the default of `prefix`, and adds rules before those of `out` and `in`.
+    """
 
     name: Annotated[str, AfterValidator(check_robot)]
     servers: list[Server] = Field(min_length=1)
@@ -542,7 +628,10 @@ class UpstreamSection(_Section):
     version: ProtocolVersion = "5"
     client_id: Annotated[str, AfterValidator(check_client_id)] = "{robot}"
     user: Annotated[str, Field(min_length=1)] = "upstream"
-    prefix: Annotated[str, AfterValidator(check_fleet_prefix)] = "fleet/{robot}/"
+    profile: Annotated[ProfileSection, BeforeValidator(vda5050_in_full)] | None = None
+    prefix: Annotated[str, BeforeValidator(_default_prefix), AfterValidator(check_fleet_prefix)] = (
+        Field(None, validate_default=True)
+    )
     login: UpstreamLoginSection = _section()
     tls: UpstreamTlsSection = _section()
     proxy: Annotated[Proxy | None, Field(repr=False)] = None
@@ -551,8 +640,31 @@ class UpstreamSection(_Section):
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     bytes_per_second: Annotated[Size, Field(gt=0)] | None = None
     backlog: BacklogSection = _section()
-    out: list[OutSection] = []
-    inward: list[InSection] = Field(default=[], alias="in")  # `in` is a word of Python's
+    out: list[OutSection] = Field(default=[], validate_default=True)
+    inward: list[InSection] = Field(  # `in` is a word of Python's
+        default=[], alias="in", validate_default=True
+    )
+
+    @field_validator("out")
+    @classmethod
+    def _add_out(cls, rules: list[OutSection], info: ValidationInfo) -> list[OutSection]:
+        vda5050 = _vda5050_of(info)
+        return rules if vda5050 is None else _with_rules(rules, vda5050.out())
+
+    @field_validator("inward")
+    @classmethod
+    def _add_inward(cls, rules: list[InSection], info: ValidationInfo) -> list[InSection]:
+        vda5050 = _vda5050_of(info)
+        return rules if vda5050 is None else _with_rules(rules, vda5050.inward())
+
+
+def _with_rules(rules: list[MappedT], more: list[MappedT]) -> list[MappedT]:
+    """The rules, and before them those of `more` in whose place none of them stands."""
+    said = {rule.local_prefix + rule.topic for rule in rules}
+    added = [rule for rule in more if rule.local_prefix + rule.topic not in said]
+    for rule in added:
+        rule._is_added = True
+    return [*added, *rules]
 
 
 class LogSection(_Section):

@@ -96,6 +96,36 @@ def check_fleet_prefix(value: str) -> str:
     return value
 
 
+def check_vda5050_version(value: str) -> str:
+    if not re.fullmatch(r"[23]\.\d{1,4}(\.\d{1,4})?", value):
+        raise ValueError("must be a version of VDA 5050, such as 2.1 or 3.0")
+    return value
+
+
+def check_vda5050_level(value: str) -> str:
+    """A level of VDA 5050's topics (2.1 section 6.3, 3.0 section 4.2)."""
+    plain = _check_robot_only(value)
+    if not plain or set(plain) & set("/+#$"):
+        raise ValueError("must be one level of a topic, without '/', '+', '#' and '$'")
+    return value
+
+
+def check_vda5050_serial_number(value: str) -> str:
+    """As the level above, with the characters that are left to serial numbers."""
+    if not re.fullmatch(r"[A-Za-z0-9_.:-]+", _check_robot_only(value)):
+        raise ValueError("must be letters, digits, '_', '.', ':' and '-', by VDA 5050")
+    return value
+
+
+def vda5050_in_full(value: object) -> object:
+    """`vda5050` alone is the profile with its defaults."""
+    if value == "vda5050":
+        return {"vda5050": {}}
+    if isinstance(value, str):
+        raise ValueError("must be vda5050, the only profile")
+    return value
+
+
 def check_relative_filter(value: str) -> str:
     """A topic filter without its beginning; it is empty where the prefixes are whole topics."""
     if "{" in value or "}" in value:
@@ -334,6 +364,11 @@ ClientCertificates = Annotated[
 
 
 ProtocolVersion = Annotated[Literal["5", "3.1.1"], BeforeValidator(_unquoted_protocol)]
+
+
+Vda5050Version = Annotated[
+    str, BeforeValidator(_unquoted_version), AfterValidator(check_vda5050_version)
+]
 
 
 TlsVersion = Annotated[Literal["1.2", "1.3"], BeforeValidator(_unquoted_version)]

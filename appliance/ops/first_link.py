@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from urllib.parse import unquote
 
 from appliance.config import ServerUrl, UpstreamSection
+from appliance.config.settings import Vda5050Section
 from appliance.config.urls import parse_server
 from appliance.upstream.limits import KINDS, kind_of_host
 
@@ -27,6 +28,26 @@ upstreams:
     #  in: [{{topic: cmd_vel, late: 500 ms}}]
 """
 
+_VDA5050_SECTION = """
+# The link to the fleet's broker, which speaks VDA 5050: {{robot}}/vda5050/… here. See
+# docs/vda5050.md; `appliance check` says what is missing.
+upstreams:
+  - name: {name}
+    servers: ["{server}"]
+{login}    profile:
+      vda5050:
+        version: "{vda5050.version}"             # as the fleet control expects it
+        manufacturer: '{manufacturer}'
+        serial_number: "{vda5050.serial_number}"   # the robot's name
+"""
+
+_VDA5050_RULES = """
+# The link to the fleet's broker. Nobody logs in as this user: `read` is what goes there, `write`
+# is what may come from there.
+user {user}
+{lines}
+"""
+
 _RULES = """
 # The link to the fleet's broker. Nobody logs in as this user: `read` is what goes there, `write`
 # is what may come from there.
@@ -41,8 +62,8 @@ topic write {{robot}}/_upstream/{name}/#
 
 
 #: What the first user may do, so that there is something to send from the first minute.
-FIRST_USER_RULES = """# What the link to the fleet's broker sends.
-topic write {robot}/events/#
+_FIRST_USER_RULES = """# What the link to the fleet's broker sends.
+{lines}
 """
 
 
@@ -50,12 +71,17 @@ topic write {robot}/events/#
 class FirstLink:
     """A link to be added: the text of its section, and of the rules of its user.
 
+    `user_rules` are for the first user, who may publish what the link sends. `prefix` is that of
+    the link; what is published at the first topic of `example` is at the second one there.
     `password_file` is relative to appliance.yaml; it is None without a `username`.
     """
 
     server: ServerUrl
     section: str
     rules: str
+    user_rules: str
+    prefix: str
+    example: tuple[str, str]
     username: str | None = None
     password_file: str | None = None
 
@@ -65,14 +91,18 @@ class FirstLink:
         if self.password_file is not None:
             steps.append(f"put the password into {self.password_file}")
         who = "this client" if self.username is None else f"the user {self.username}"
-        steps.append(f"let {who} read and write fleet/{robot}/# at {self.server.host}")
+        here, there = (each.replace("{robot}", robot) for each in self.example)
+        prefix = self.prefix.replace("{robot}", robot)
+        steps.append(f"let {who} read and write {prefix}# at {self.server.host}")
         steps.append("appliance check, then appliance run, then appliance upstream")
-        steps.append(f"what is published at {robot}/events/test is at fleet/{robot}/events/test")
+        steps.append(f"what is published at {here} is at {there}")
         return steps
 
 
-def parse_first_link(url: str) -> FirstLink:
+def parse_first_link(url: str, vda5050: Vda5050Section | None = None) -> FirstLink:
     """The link to `mqtts://broker.example`, or, with a user, `mqtts://alice@broker.example`.
+
+    With `vda5050` it speaks that.
 
     Raises:
         ValueError: it is no such URL, or a password is in it.
@@ -100,12 +130,28 @@ def parse_first_link(url: str) -> FirstLink:
         lines.append(
             "# tls: {ca: fleet-ca.crt}          # where this computer does not trust it yet"
         )
+    values: dict[str, object] = {"name": LINK_NAME, "server": server, "user": LINK_USER}
+    values["login"] = "".join(f"    {line}\n" for line in lines)
+    section, rules, sent, prefix = _SECTION, _RULES, ["{robot}/events/#"], "fleet/{robot}/"
+    example = "{robot}/events/test", "fleet/{robot}/events/test"
+    if vda5050 is not None:
+        section, rules = _VDA5050_SECTION, _VDA5050_RULES
+        values["vda5050"] = vda5050
+        values["manufacturer"] = vda5050.manufacturer.replace("'", "''")
+        here, prefix = vda5050.local_prefix, vda5050.prefix
+        example = f"{here}state", f"{prefix}state"
+        sent = [here + rule.topic for rule in vda5050.out()]
+        values["lines"] = "\n".join(
+            [f"topic read {each}" for each in sent]
+            + [f"topic write {here}{rule.topic}" for rule in vda5050.inward()]
+        )
     return FirstLink(
         server,
-        _SECTION.format(
-            name=LINK_NAME, server=server, login="".join(f"    {line}\n" for line in lines)
-        ),
-        _RULES.format(name=LINK_NAME, user=LINK_USER),
+        section.format(**values),
+        rules.format(**values),
+        _FIRST_USER_RULES.format(lines="\n".join(f"topic write {each}" for each in sent)),
+        prefix,
+        example,
         username,
         password_file,
     )

@@ -18,9 +18,9 @@ from pathlib import Path
 from appliance import certs, config
 from appliance.access import Acl, Passwords, check_username
 from appliance.config import ConfigError
+from appliance.config.settings import Vda5050Section
 from appliance.host.environment import of_service
 from appliance.ops.first_link import (
-    FIRST_USER_RULES,
     LINK_USER,
     FirstLink,
     parse_first_link,
@@ -141,12 +141,14 @@ def initialise(
     configuration: str = CONFIGURATION,
     names: Sequence[str] = (),
     upstream: str | None = None,
+    manufacturer: str | None = None,
 ) -> Iterator[InitStep | Credentials | NextSteps]:
     """Create what is missing in `directory`, and yield each step when it is done.
 
     `configuration` is the text for a missing appliance.yaml, with `{robot}` in it; `names` are DNS
     names for the server's certificate, in addition to those that this computer knows. `upstream`
-    is the URL of a fleet's broker to add a link to.
+    is the URL of a fleet's broker to add a link to, which speaks VDA 5050 as a robot of that
+    `manufacturer` if there is one.
 
     Raises InitError, or ConfigError, AccessFileError or CertificateError of the parts; what was
     created until then is complete and stays.
@@ -155,8 +157,16 @@ def initialise(
         check_username(user)
     except ValueError as error:
         raise InitError(str(error)) from None
+    if manufacturer is not None and upstream is None:
+        raise InitError("--vda5050 needs --upstream: the URL of the fleet's broker")
     try:
-        first = None if upstream is None else parse_first_link(upstream)
+        vda5050 = None if manufacturer is None else Vda5050Section(manufacturer=manufacturer)
+    except ValueError:
+        raise InitError(
+            "--vda5050 must be the manufacturer's name, without '/', '+', '#' and '$'"
+        ) from None
+    try:
+        first = None if upstream is None else parse_first_link(upstream, vda5050)
     except ValueError as error:
         raise InitError(f"--upstream {error}") from None
     directory.mkdir(parents=True, exist_ok=True)
@@ -171,7 +181,7 @@ def initialise(
     yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     rules = ACCESS.format(user=user, calls=calls or NO_CALLS)
-    made = _write_new(settings.broker.acl, rules + (FIRST_USER_RULES if first else ""))
+    made = _write_new(settings.broker.acl, rules + (first.user_rules if first else ""))
     yield InitStep(settings.broker.acl, made, "access rules")
     if first is not None:
         yield from _link(settings, file, first)

@@ -827,7 +827,7 @@ class Backlog:
             entry.key = key
             entry.topic = topic
             queue.newest[topic] = entry
-            if key is None:
+            if key is None or queue.rule.qos == 0:
                 entry.qos = min(1, entry.record.qos)
             return self._hand_out(entry, now)
         data = queue.live.popleft()

@@ -315,6 +315,8 @@ class InSession:
             dup=packet.dup,
             retain=packet.retain,
         )
+        if packet.retain and rule.retained == "drop":
+            verdict = Verdict.RETAINED
         if verdict is Verdict.TAKE:
             return False
         self._counters.dropped[rule.remote_filter, verdict] += 1

@@ -32,6 +32,7 @@ class Verdict(Enum):
     EXPIRED = "expired"
     REPEATED = "sent again"
     LATE = "late"
+    RETAINED = "retained"
 
 
 def judge(

@@ -26,6 +26,7 @@ from appliance.upstream.credentials import Credentials, read_credentials
 from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
 from appliance.upstream.limits import KINDS, alpn
+from appliance.upstream.presence import Presence
 from appliance.upstream.refusals import ending_advice
 from appliance.upstream.transport import UpstreamTransport
 from appliance.upstream.versions import ServerVersions
@@ -124,7 +125,7 @@ class Line:
 
     def _say_offline(self, channel: Channel) -> None:
         if channel.connection.granted is not None and not self.is_kept:
-            self._link.publish_state(channel, b"offline")
+            self._link.publish_state(channel, Presence.OFFLINE)
 
     async def _run(self) -> None:
         interval = KINDS[self._settings.kind].connect_interval

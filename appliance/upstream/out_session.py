@@ -223,14 +223,16 @@ class OutSession:
             expires_at += now - broker.now
             if expires_at <= now:
                 return
+        qos = message.qos if rule.qos is None else min(message.qos, rule.qos)
+        retain = message.retain if rule.retain is None else rule.retain
         try:
             topic, properties = self._properties(topic, message)
             refusal = self._backlog.offer(
                 rule,
                 topic,
                 message.payload,
-                message.qos,
-                message.retain,
+                qos,
+                retain,
                 properties,
                 expires_at,
                 now,

@@ -95,11 +95,16 @@ def _moved(topic: str, filter: str, prefix: str, other: str) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class OutRule(MappedTopics):
-    """Carries topics from here to the fleet's broker; `rate` in messages a second."""
+    """Carries topics from here to the fleet's broker; `rate` in messages a second.
+
+    `qos` is the most, and `retain` takes the place of what the publisher says; None: as it says.
+    """
 
     keep: KeepRule = "auto"
     priority: Priority = "normal"
     rate: float | None = None
+    qos: int | None = None
+    retain: bool | None = None
 
     @property
     def lane(self) -> int:
@@ -123,10 +128,12 @@ class InRule(MappedTopics):
 
     A message that may be older than `late` seconds is dropped; None: none is. With `offline` keep
     the fleet's broker queues messages while the link is down, so that they are late on purpose.
+    What is `retained` there is of unknown age: no command, or, with `drop`, nothing at all.
     """
 
     late: float | None = LATE
     offline: Literal["drop", "keep"] = "drop"
+    retained: Literal["take", "drop"] = "take"
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,11 +187,20 @@ class BacklogLimits:
 
 
 @dataclass(frozen=True, slots=True)
+class Vehicle:
+    """Who the robot is by VDA 5050, as the header of each message says it (2.1 section 6.4)."""
+
+    version: str
+    manufacturer: str
+    serial_number: str
+
+
+@dataclass(frozen=True, slots=True)
 class UpstreamSettings:
     """A link: an entry of `upstreams` in appliance.yaml, with its placeholders replaced.
 
     `version` is the protocol level, see `mqtt.codec`; `keep_alive` is in seconds, `rate` in
-    messages a second. `prefix` ends with `/`.
+    messages a second. `prefix` ends with `/`. A link with a `vehicle` speaks VDA 5050.
     """
 
     name: str
@@ -205,6 +221,7 @@ class UpstreamSettings:
     backlog: BacklogLimits
     out: tuple[OutRule, ...]
     inward: tuple[InRule, ...]
+    vehicle: Vehicle | None = None
 
     @property
     def answers_here(self) -> str:
@@ -218,8 +235,8 @@ class UpstreamSettings:
 
     @property
     def state_there(self) -> str:
-        """The topic there of the link's state, `online` or `offline`, retained."""
-        return f"{self.prefix}_appliance/state"
+        """The topic there at which the link says whether the robot is online, see `presence`."""
+        return self.prefix + ("_appliance/state" if self.vehicle is None else "connection")
 
     @property
     def status_here(self) -> str:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from appliance.config import Settings, TopicRoute, UpstreamSection
-from appliance.config.settings import InSection
+from appliance.config.settings import InSection, ProfileSection
 from appliance.mqtt.codec import V5, V311
 from appliance.upstream.rules import (
     BacklogLimits,
@@ -16,6 +16,7 @@ from appliance.upstream.rules import (
     UpstreamLogin,
     UpstreamSettings,
     UpstreamTls,
+    Vehicle,
     default_late,
 )
 
@@ -96,6 +97,16 @@ def _upstream(
             )
             for rule in section.inward
         ),
+        vehicle=None if section.profile is None else _vehicle(section.profile, robot),
+    )
+
+
+def _vehicle(profile: ProfileSection, robot: str) -> Vehicle:
+    said = profile.vda5050
+    return Vehicle(
+        said.version if said.version.count(".") == 2 else f"{said.version}.0",
+        said.manufacturer.replace("{robot}", robot),
+        said.serial_number.replace("{robot}", robot),
     )
 
 

@@ -32,6 +32,7 @@ from appliance.upstream.in_session import InCounters, InSession
 from appliance.upstream.limits import KINDS
 from appliance.upstream.line import AGAIN, Line
 from appliance.upstream.out_session import OutSession
+from appliance.upstream.presence import Presence, presence_messages
 from appliance.upstream.refusals import (
     reason_words,
     state_advice,
@@ -80,6 +81,7 @@ class Uplink:
         self._scheduler = parts.scheduler
         self._loop = parts.entries.loop
         self._rules = LinkRules(settings)
+        self._presence = presence_messages(settings)
         self._answers = Answers(settings)
         self._journal_clock = parts.backlogs.journal(settings.name, 0).now
         limits = KINDS[settings.kind]
@@ -207,7 +209,7 @@ class Uplink:
             return
         if self._state_due and channel.connection.room:
             self._state_due = False
-            self.publish_state(channel, b"online")
+            self.publish_state(channel, Presence.ONLINE)
         if not self._is_settled:
             return  # so that an end of the connection is not taken for that of a message
         if self._sender.send(channel.connection):
@@ -293,7 +295,7 @@ class Uplink:
     def _line_of(self, channel: Channel) -> Line:
         return self._lines[channel.is_kept]
 
-    def publish_state(self, channel: Channel, state: bytes) -> None:
+    def publish_state(self, channel: Channel, presence: Presence) -> None:
         """Say there whether the robot is online; the will says when it is not any more."""
         connection = channel.connection
         granted = connection.granted
@@ -303,6 +305,7 @@ class Uplink:
         # With QoS 0 where the window has no room: before the end, nothing else will follow.
         qos = min(1, granted.maximum_qos, connection.room)
         retain = granted.retain and limits.retain
+        state = self._presence.payload(presence)
         connection.publish(None, self.settings.state_there, state, qos, retain)
         if not qos:
             self._is_settled = True
@@ -319,7 +322,8 @@ class Uplink:
         limits = KINDS[settings.kind]
         will = None
         if not is_kept:
-            will = Will(settings.state_there, b"offline", min(1, limits.qos), limits.retain)
+            state = self._presence.payload(Presence.BROKEN)
+            will = Will(settings.state_there, state, min(1, limits.qos), limits.retain)
         return ConnectSettings(
             client_id=self.client_id(is_kept=is_kept),
             version=version,

@@ -19,6 +19,9 @@ from appliance.config.settings import (
 )
 from appliance.config.urls import parse_server
 
+ACME = "manufacturer: acme"
+VDA5050 = f"profile: {{vda5050: {{{ACME}}}}}"
+
 
 def link(text: str = "", **environment: str) -> UpstreamSection:
     """The link with these keys beside a name and a server."""
@@ -236,10 +239,59 @@ def test_versions(text: str, version: str) -> None:
         ("in: [{topic: a, late: 5}]", "in[0].late: must be a duration"),
         ("in: [{topic: a, late: 5 s, offline: keep}]", "in[0].late: is not for offline: keep"),
         ("in: [{topic: a, offline: queue}]", "in[0].offline: must be drop or keep"),
+        ("in: [{topic: a, retained: keep}]", "in[0].retained: must be take or drop"),
+        ("out: [{topic: a, qos: 2}]", "out[0].qos: must be at most 1"),
+        ("profile: opc", "profile: must be vda5050, the only profile"),
+        ("profile: []", "profile: must be keys with values, such as `profile: {vda5050: {manu"),
+        ("profile: vda5050", "profile.vda5050.manufacturer: is needed"),
+        ("profile: {vda5050: {manufacturer: a/b}}", "profile.vda5050.manufacturer: must be one"),
+        ("profile: {vda5050: {manufacturer: ''}}", "profile.vda5050.manufacturer: must be one"),
+        (f"profile: {{vda5050: {{{ACME}, interface_name: $x}}}}", "profile.vda5050.interface_name"),
+        (f"profile: {{vda5050: {{{ACME}, version: 1.1}}}}", "profile.vda5050.version: must be a"),
+        (f"profile: {{vda5050: {{{ACME}, serial_number: a b}}}}", "profile.vda5050.serial_number:"),
+        (f"{VDA5050}, in: [{{topic: order}}]", "in[0].topic: is the same as in profile"),
+        (f"{VDA5050}, out: [{{topic: 'a#'}}]", "out[0].topic: makes no topic filter here"),
+        (f"{VDA5050}, prefix: $x/", "prefix: must not begin with '$'"),
+        (
+            f"version: 3.1.1, {VDA5050}, in: [{{topic: state}}]",
+            "in[0].topic: overlaps profile at the fleet's broker (uagv/v2/acme/robot/state",
+        ),
     ],
 )
 def test_what_cannot_be(text: str, problem: str) -> None:
     assert wrong(text).startswith(problem)
+
+
+def test_a_profile_is_a_prefix_and_rules() -> None:
+    found = link(VDA5050)
+    assert found.prefix == "uagv/v2/acme/{robot}/"
+    assert [rule.topic for rule in found.out] == ["state", "factsheet", "visualization"]
+    assert [rule.topic for rule in found.inward] == ["order", "instantActions"]
+    assert {rule.local_prefix for rule in (*found.out, *found.inward)} == {"{robot}/vda5050/"}
+    newer = link(f"profile: {{vda5050: {{{ACME}, version: 3.0, serial_number: '7'}}}}")
+    assert newer.prefix == "vda5050/v3/acme/7/"
+    assert [rule.topic for rule in newer.inward[2:]] == ["zoneSet", "responses"]
+    named = link(f"profile: {{vda5050: {{{ACME}, interface_name: fts, local_prefix: agv/}}}}")
+    assert named.prefix == "fts/v2/acme/{robot}/" and named.out[0].local_prefix == "agv/"
+
+
+def test_what_the_file_says_goes_before_a_profile() -> None:
+    mine = "{topic: state, local_prefix: '{robot}/vda5050/', qos: 1}"
+    found = link(f"{VDA5050}, prefix: cloud/, out: [{{topic: '#'}}, {mine}], in: [{{topic: x}}]")
+    assert found.prefix == "cloud/"
+    # A filter with wildcards does not take the topics of the profile.
+    said = [(rule.topic, rule.is_added) for rule in (*found.out, *found.inward)]
+    assert said == [
+        ("factsheet", True),
+        ("visualization", True),
+        ("#", False),
+        ("state", False),
+        ("order", True),
+        ("instantActions", True),
+        ("x", False),
+    ]
+    described = config.describe(loads(f"upstreams: [{{{_with(VDA5050)}}}]"))
+    assert config.describe(config.loads(yaml.safe_dump(described), HERE)) == described
 
 
 def test_names_and_servers() -> None:

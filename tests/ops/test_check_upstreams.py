@@ -101,6 +101,32 @@ def test_tls_of_a_link_that_has_none(here: Path) -> None:
     assert told == ["warning tls: no server of it is dialled with TLS"]
 
 
+def test_a_link_by_vda5050(here: Path) -> None:
+    profile = {"vda5050": {"manufacturer": "acme"}}
+    lines = [
+        f"warning {what}: no rule lets the user 'upstream' {access} r2/vda5050/{name}; add to "
+        f"acl.conf below the line `user upstream`: topic {access} {{robot}}/vda5050/{name}"
+        for what, access, name in (
+            ("out state", "read", "state"),
+            ("out factsheet", "read", "factsheet"),
+            ("out visualization", "read", "visualization"),
+            ("in order", "write", "order"),
+            ("in instantActions", "write", "instantActions"),
+        )
+    ]
+    assert troubles(here, profile=profile, out=[]) == lines
+    with (here / "acl.conf").open("a") as file:
+        file.writelines(f"{line.partition('upstream`: ')[2]}\n" for line in lines)
+    assert troubles(here, profile=profile, out=[]) == []
+    said = "VDA 5050 2.1.0: acme/r2, online and offline at uagv/v2/acme/r2/connection"
+    assert said in [each.text for each in found(here, profile=profile, out=[])]
+    profile["vda5050"]["manufacturer"] = "acme & sons"
+    (trouble,) = troubles(here, profile=profile, out=[])
+    assert trouble.startswith("warning profile: the manufacturer 'acme & sons' has other char")
+    told = troubles(here, profile=profile, kind="azure-event-grid")
+    assert "error profile: VDA 5050 needs uagv/v2/acme & sons/r2/connection retained" in told
+
+
 def test_the_default_name_of_robots(here: Path) -> None:
     told = [each for each in troubles(here, robot="robot") if "robot's name" in each]
     assert len(told) == 1 and told[0].startswith("warning the robot's name is 'robot'")

@@ -12,7 +12,7 @@ from appliance.access import Acl
 from appliance.broker.ports import Action, Identity
 from appliance.config import ServerUrl
 from appliance.ops.check import check
-from appliance.ops.init import InitError, InitStep, initialise
+from appliance.ops.init import InitError, InitStep, NextSteps, initialise
 from appliance.upstream.settings import upstreams
 
 URL = "mqtts://broker.example"
@@ -132,6 +132,35 @@ def test_a_link_with_a_login(tmp_path: Path) -> None:
     assert troubles(tmp_path) == []
     (link,) = upstreams(config.load(tmp_path / "appliance.yaml"))
     assert (link.login.username, link.login.password_file) == ("o'neil", file)
+
+
+@pytest.mark.parametrize("manufacturer", ["acme", "o'neil {& sons}"])
+def test_a_link_by_vda5050(tmp_path: Path, manufacturer: str) -> None:
+    steps = initialise(tmp_path, robot="r2", upstream=URL, manufacturer=manufacturer)
+    if "{" in manufacturer:
+        with pytest.raises(InitError, match="--vda5050 must be the manufacturer's name"):
+            list(steps)
+        steps = initialise(tmp_path, robot="r2", upstream=URL, manufacturer="o'neil")
+        manufacturer = "o'neil"
+    list(steps)
+    (link,) = upstreams(config.load(tmp_path / "appliance.yaml"))
+    assert link.state_there == f"uagv/v2/{manufacturer}/r2/connection"
+    assert [rule.topic for rule in link.inward] == ["order", "instantActions"]
+    assert [each for each in troubles(tmp_path) if "recommends" not in each] == []
+
+
+def test_a_link_by_vda5050_says_what_to_do_next(tmp_path: Path) -> None:
+    steps = list(initialise(tmp_path, robot="r2", upstream=URL, manufacturer="acme"))
+    (next_steps,) = [each for each in steps if isinstance(each, NextSteps)]
+    said = "\n".join(next_steps.texts)
+    assert "let this client read and write uagv/v2/acme/r2/# at broker.example" in said
+    assert "published at r2/vda5050/state is at uagv/v2/acme/r2/state" in said
+
+
+def test_vda5050_is_of_a_link(tmp_path: Path) -> None:
+    with pytest.raises(InitError, match="--vda5050 needs --upstream"):
+        list(initialise(tmp_path / "new", manufacturer="acme"))
+    assert not (tmp_path / "new").exists()
 
 
 def test_brokers_of_a_kind(tmp_path: Path) -> None:

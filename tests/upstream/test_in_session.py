@@ -189,6 +189,20 @@ def test_late_expired_and_repeated_commands_are_dropped_and_counted(rig: Rig) ->
     }
 
 
+def test_what_is_retained_there_does_not_come_by_a_rule_that_drops_it(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, keys="user: upstream, in: [{topic: order, retained: drop}, {topic: map}]")
+    rig.begin()
+    ear = hear(rig)
+    fleet = rig.connect()
+    for qos in (0, 1):
+        fleet.send("fleet/r2/order", b"old", qos=qos, retain=True)
+        fleet.send("fleet/r2/map", b"state", qos=qos, retain=True)
+        fleet.send("fleet/r2/order", b"new", qos=qos)
+    assert [message.payload for message, _, _ in ear.came] == [b"state", b"new"] * 2
+    assert dropped(rig) == {("order", "RETAINED"): 2}
+    assert not rig.broker.retained.get("r2/order")
+
+
 def test_rules_that_keep_what_came_offline_take_it_and_tell_that_its_age_is_unknown(
     rig: Rig,
 ) -> None:

@@ -55,6 +55,24 @@ def test_what_the_rules_carry_is_offered_as_it_is_there(rig: Rig) -> None:
     assert rig.out.counters.offered == 2
 
 
+def test_a_rule_may_say_with_which_qos_and_whether_retained(tmp_path: Path) -> None:
+    out = "[{topic: a, qos: 0}, {topic: b, qos: 1, retain: true}, {topic: c, retain: false}]"
+    rig = Rig(tmp_path, keys=f"user: upstream, out: {out}")
+    rig.begin()
+    peer = rig.join()
+    for topic in "abc":
+        peer.publish(f"r2/{topic}", b"x", 0)
+        peer.publish(f"r2/{topic}", b"x", 2, retain=True)
+    assert [(each.topic[9:], each.qos, each.retain) for each in rig.backlog.offers] == [
+        ("a", 0, False),
+        ("a", 0, True),
+        ("b", 0, True),
+        ("b", 1, True),
+        ("c", 0, False),
+        ("c", 2, False),
+    ]
+
+
 def test_the_access_rules_hold_for_it(rig: Rig) -> None:
     rig.reload(ACL.replace("{robot}/secret/#", "{robot}/events/secret/#"))
     rig.begin()

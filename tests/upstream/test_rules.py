@@ -18,6 +18,7 @@ from appliance.config.settings import (
     UpstreamLoginSection,
     UpstreamSection,
     UpstreamTlsSection,
+    Vda5050Section,
 )
 from appliance.mqtt.codec import V5, V311
 from appliance.mqtt.topics import MAX_TOPIC, check_filter, check_topic, matches
@@ -350,3 +351,33 @@ def test_the_page_has_every_key() -> None:
     keys = {field.alias or name for each in sections for name, field in each.model_fields.items()}
     assert {key for key in keys if f"`{key}`" not in PAGE} == set()
     assert {kind for kind in KINDS if f"`{kind}`" not in PAGE} == set()
+
+
+VDA5050 = (Path(__file__).parents[2] / "docs/vda5050.md").read_text()
+
+
+def test_the_topics_of_the_page_of_vda5050_are_mapped_so() -> None:
+    rows = re.findall(r"^\| `(.+?)` \| `(.+?)` \| (in|out) \|", VDA5050, re.M)
+    assert len(rows) == 7
+    for here, there, direction in rows:
+        version = "3.0" if "/v3/" in there else "2.1"
+        for each in {version, "3.0"}:
+            keys = f"profile: {{vda5050: {{manufacturer: acme, version: {each}}}}}"
+            rules = LinkRules(link(keys, robot="r2d2"))
+            moved = there.replace("uagv/v2", "vda5050/v3") if each == "3.0" else there
+            found = rules.out(here) if direction == "out" else rules.inward(moved)
+            assert found is not None and found[1] == (moved if direction == "out" else here)
+    assert not re.search(r"connection` \| (in|out)", VDA5050)
+
+
+def test_the_connection_of_vda5050_is_the_links_own() -> None:
+    keys = "profile: {vda5050: {manufacturer: acme}}, out: [{topic: '#'}], in: [{topic: '#'}]"
+    rules = LinkRules(link(keys))
+    assert rules.inward("uagv/v2/acme/r2/connection") is None and rules.out("r2/connection") is None
+    assert rules.out("r2/x") is not None and rules.inward("uagv/v2/acme/r2/x") is not None
+
+
+def test_the_page_of_vda5050_has_every_key() -> None:
+    for key, field in Vda5050Section.model_fields.items():
+        shown = f'`"{field.default}"`' if isinstance(field.default, str) else ""
+        assert f"| `{key}` | {shown}" in VDA5050

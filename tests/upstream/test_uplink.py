@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 
 import pytest
@@ -128,6 +129,39 @@ async def test_online_and_offline_are_said_there_and_here(tmp_path: Path) -> Non
             assert state is not None and state.payload == b"1"
         assert payloads(fleet, "fleet/r2d2/_appliance/state") == [b"online", b"offline"]
         assert fleet.visit.disconnect is not None
+
+
+async def test_a_link_by_vda5050_says_so_in_its_messages(tmp_path: Path) -> None:
+    profile = {"vda5050": {"manufacturer": "acme", "version": "3.0"}}
+    there = "vda5050/v3/acme/r2d2/"
+    async with FakeFleet() as fleet:
+        rig = Rig(tmp_path, fleet.port, profile=profile, out=[], **{"in": []})
+        async with running(rig):
+            await until(lambda: payloads(fleet, f"{there}connection"))
+            await publish(rig, "r2d2/vda5050/factsheet", b"{}")
+            await until(lambda: f"{there}factsheet" in fleet.topics, "the factsheet")
+            wanted = set(fleet.visit.filters)
+        will = fleet.connects[0].will
+        assert will is not None and (will.topic, will.qos, will.retain) == (
+            f"{there}connection",
+            1,
+            True,
+        )
+        said = [json.loads(each) for each in (will.payload, *payloads(fleet, will.topic))]
+        assert [each["connectionState"] for each in said] == [
+            "CONNECTION_BROKEN",
+            "ONLINE",
+            "OFFLINE",
+        ]
+        assert [each["headerId"] for each in said] == [0, 1, 2]
+        sent = [(each.topic, each.qos, each.retain) for each in fleet.published]
+        assert sent == [
+            (f"{there}connection", 1, True),
+            (f"{there}factsheet", 0, True),
+            (f"{there}connection", 1, True),
+        ]
+        names = ("order", "instantActions", "zoneSet", "responses", "_answers/+")
+        assert wanted == {there + each for each in names}
 
 
 async def test_a_message_from_there_is_published_here_and_then_acknowledged(

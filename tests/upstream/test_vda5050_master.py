@@ -1,4 +1,8 @@
-"""vda-5050-lib's master control client at the fleet's broker: what it tells of a vehicle."""
+"""vda-5050-lib's master control client at the fleet's broker: what it tells of a vehicle.
+
+The library has validators that its authors have made of the standard's schemas of 2.0, and applies
+them to whatever comes and goes here; it drops what says another version than 2.0.0.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import asyncio
 import json
 import shutil
 import subprocess
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Iterator
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -14,12 +18,22 @@ from typing import Any
 import pytest
 from waiting import until
 
-from appliance.mqtt.packets import Will
+from appliance.mqtt.packets import Publish
 from upstream.client import MqttClient
+from upstream.device import ApplianceDevice
 from upstream.peers import HOST, PASSWORD, USER, FleetMosquitto
 
 DIRECTORY = Path(__file__).parent / "vda5050"
-CONNECTION = "uagv/v2/acme/r2d2/connection"
+THERE = "uagv/v2/acme/r2d2/"
+CONNECTION = f"{THERE}connection"
+HERE = "r2d2/vda5050/"
+
+ORDER = {
+    "orderId": "7",
+    "orderUpdateId": 0,
+    "nodes": [{"nodeId": "door", "sequenceId": 0, "released": True, "actions": []}],
+    "edges": [],
+}
 
 
 @pytest.fixture(scope="session")
@@ -32,9 +46,40 @@ def _installed() -> None:
         subprocess.run(command, cwd=DIRECTORY, check=True, timeout=120)
 
 
+class Master:
+    """The client, and what it prints."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.lines: list[dict[str, Any]] = []
+        self._process = process
+
+    async def read(self) -> None:
+        assert self._process.stdout is not None
+        async for line in self._process.stdout:
+            self.lines.append(json.loads(line))
+
+    def send(self, topic: str, message: dict[str, Any]) -> None:
+        """Send the vehicle a message, to which the client adds the header."""
+        assert self._process.stdin is not None
+        said = {"topic": topic, "serialNumber": "r2d2", "object": message}
+        self._process.stdin.write(json.dumps(said).encode() + b"\n")
+
+    @property
+    def states(self) -> list[str]:
+        """The states of the vehicle's connection that it told, in their order."""
+        return [each["state"] for each in self.lines if "state" in each]
+
+    async def sees(self, *states: str) -> None:
+        await until(lambda: self.states == [*states], f"{states}")
+
+    @property
+    def errors(self) -> list[str]:
+        return [each["error"] for each in self.lines if "error" in each]
+
+
 @pytest.fixture
-async def told(_installed: None, fleet: FleetMosquitto) -> AsyncIterator[list[dict[str, Any]]]:
-    """What a master control client prints."""
+async def master(_installed: None, fleet: FleetMosquitto) -> AsyncIterator[Master]:
+    """A master control client that begins with no vehicle."""
     options = {
         "url": f"mqtt://{HOST}:{fleet.plain_port}",
         "username": USER,
@@ -48,50 +93,117 @@ async def told(_installed: None, fleet: FleetMosquitto) -> AsyncIterator[list[di
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    lines: list[dict[str, Any]] = []
-
-    async def read() -> None:
-        assert process.stdout is not None
-        async for line in process.stdout:
-            lines.append(json.loads(line))
-
-    reading = asyncio.create_task(read())
+    master = Master(process)
+    reading = asyncio.create_task(master.read())
     try:
-        await until(lambda: {"ready": True} in lines, "the client is ready")
-        yield lines
+        await until(lambda: {"ready": True} in master.lines, "the client is ready")
+        yield master
     finally:
         process.kill()
         await process.wait()
         await reading
+        forgetful = await MqttClient.dial(fleet.plain_port)
+        for topic in ("connection", "factsheet"):
+            await forgetful.publish(THERE + topic, b"", retain=True)
+        await forgetful.close()
 
 
-def connection(state: str, number: int) -> bytes:
-    """The message of the topic `connection`, section 6.13 of VDA 5050 2.0."""
+@pytest.fixture
+def device(tmp_path: Path, fleet: FleetMosquitto) -> Iterator[ApplianceDevice]:
+    """An appliance in a process of its own, with a link by the profile; not started."""
+    link = {
+        "profile": {"vda5050": {"manufacturer": "acme", "version": "2.0"}},
+        "keep_alive": "1 s",
+        "out": [],
+        "in": [],
+    }
+    device = ApplianceDevice(tmp_path, fleet.plain_port, link=link)
+    yield device
+    device.kill()
+
+
+def header(number: int = 0) -> dict[str, Any]:
+    """What each message begins with, section 6.4 of VDA 5050 2.0."""
     now = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    header = {"headerId": number, "timestamp": now, "version": "2.0.0"}
     vehicle = {"manufacturer": "acme", "serialNumber": "r2d2"}
-    return json.dumps({**header, **vehicle, "connectionState": state}).encode()
+    return {"headerId": number, "timestamp": now, "version": "2.0.0", **vehicle}
 
 
-async def test_it_sees_online_offline_and_a_broken_connection(
-    fleet: FleetMosquitto, told: list[dict[str, Any]]
+def state(order: str) -> bytes:
+    """The message of the topic `state`, as the robot's own node makes it."""
+    message = {
+        **header(),
+        "orderId": order,
+        "orderUpdateId": 0,
+        "lastNodeId": "door",
+        "lastNodeSequenceId": 0,
+        "nodeStates": [],
+        "edgeStates": [],
+        "actionStates": [],
+        "driving": False,
+        "batteryState": {"batteryCharge": 80.0, "charging": False},
+        "operatingMode": "AUTOMATIC",
+        "errors": [],
+        "safetyState": {"eStop": "NONE", "fieldViolation": False},
+    }
+    return json.dumps(message).encode()
+
+
+async def test_it_sees_a_vehicle_online_commands_it_and_sees_it_offline(
+    fleet: FleetMosquitto, master: Master, device: ApplianceDevice
 ) -> None:
-    will = Will(CONNECTION, connection("CONNECTIONBROKEN", 0), 1, True)
-    robot = await MqttClient.dial(fleet.plain_port, "r2d2", will=will)
+    there = await MqttClient.dial(fleet.plain_port)
+    await there.subscribe(f"{THERE}+")
 
-    def seen(state: str) -> Callable[[], bool]:
-        return lambda: any(each.get("state") == state for each in told)
+    def said(topic: str) -> list[Publish]:
+        return [packet for _, packet in there.messages if packet.topic == THERE + topic]
 
-    await robot.publish(CONNECTION, connection("ONLINE", 1), retain=True)
-    await until(seen("ONLINE"))
-    await robot.publish(CONNECTION, connection("OFFLINE", 2), retain=True)
-    await until(seen("OFFLINE"))
-    await robot.publish(CONNECTION, connection("ONLINE", 3), retain=True)
-    robot.abort()  # without DISCONNECT: the will
-    await until(seen("CONNECTIONBROKEN"))
+    await asyncio.to_thread(device.start)
+    await master.sees("ONLINE")
+    node = await MqttClient.dial(device.port, user=device.user, password=device.password)
+    await node.subscribe(f"{HERE}order")
+    master.send("order", ORDER)
+    (order,) = await node.wait_for(1, "order")
+    assert json.loads(order.payload)["orderId"] == "7"
+    assert order.payload == said("order")[0].payload
+
+    await node.publish(f"{HERE}factsheet", b"{}")
+    standing = state("7")
+    await node.publish(f"{HERE}state", standing)
+    await until(lambda: any(each.get("order") == "7" for each in master.lines), "the state")
+    assert [(packet.payload, packet.qos) for packet in said("state")] == [(standing, 0)]
+    await until(lambda: said("factsheet"), "the factsheet")
+    later = await MqttClient.dial(fleet.plain_port)
+    await later.subscribe(f"{THERE}+")
+    found = {packet.topic: packet for packet in await later.wait_for(2, "retained messages")}
+    assert found[f"{THERE}factsheet"].payload == b"{}"
+    assert json.loads(found[CONNECTION].payload)["connectionState"] == "ONLINE"
+
+    await asyncio.to_thread(device.stop)
+    await master.sees("ONLINE", "OFFLINE")
+    assert [packet.qos for packet in said("connection")] == [1, 1]
+    assert {json.loads(packet.payload)["version"] for packet in said("connection")} == {"2.0.0"}
+    assert not master.errors
+    for client in (there, later, node):
+        client.abort()
+
+
+async def test_it_sees_the_connection_of_a_killed_vehicle_broken(
+    master: Master, device: ApplianceDevice
+) -> None:
+    await asyncio.to_thread(device.start)
+    await master.sees("ONLINE")
+    device.kill()
+    await master.sees("ONLINE", "CONNECTIONBROKEN")
+    assert not master.errors
+
+
+async def test_it_tells_of_what_is_not_valid(fleet: FleetMosquitto, master: Master) -> None:
+    """So that no error in the tests above says something."""
     robot = await MqttClient.dial(fleet.plain_port, "r2d2")
-    before = len(told)
-    await robot.publish(CONNECTION, connection("ASLEEP", 4), retain=True)
-    await until(lambda: any("error" in each for each in told[before:]), "it is not valid")
-    await robot.publish(CONNECTION, b"", retain=True)
+    message = {**header(), "connectionState": "ASLEEP"}
+    await robot.publish(CONNECTION, json.dumps(message).encode(), retain=True)
+    await until(lambda: master.errors, "the connection is not valid")
+    await robot.publish(f"{THERE}state", state("7").replace(b"AUTOMATIC", b"ASLEEP"))
+    await until(lambda: len(master.errors) == 2, "the state is not valid")
     robot.abort()

@@ -131,6 +131,8 @@ def _without_publisher(
     for out in link.out:
         if any(level.startswith("_") for level in out.topic.split("/")):
             continue  # answers, feedback and states of calls
+        if link.vehicle is not None and out.topic == "visualization":
+            continue  # which VDA 5050 leaves to the robot
         if not any(overlaps(out.local_filter, each) for each in published):
             line = f"topic write {out.local_filter.replace(f'{settings.robot}/', '{robot}/', 1)}"
             yield (

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,6 +42,7 @@ def upstreams(settings: Settings) -> Iterator[Finding]:
         acl = None
     for link in links(settings):
         yield from _link(settings, link)
+        yield from _vehicle(link)
         yield from _files(link)
         yield from _kind(settings, link)
         if acl is not None:
@@ -86,6 +88,29 @@ def _link(settings: Settings, link: UpstreamSettings) -> Iterator[Finding]:
             "MQTT 5 (No Local), and does not fall back to 3.1.1"
         )
         yield Finding("ok", subject, text)
+
+
+#: What VDA 5050 recommends for every name (2.1 section 6.1.2); some names it binds to that.
+_RECOMMENDED = re.compile(r"[A-Za-z0-9_.:-]+")
+
+
+def _vehicle(link: UpstreamSettings) -> Iterator[Finding]:
+    """Who the robot is by VDA 5050, and what the fleet may not understand of it."""
+    vehicle = link.vehicle
+    if vehicle is None:
+        return
+    who = f"{vehicle.manufacturer}/{vehicle.serial_number}"
+    text = f"VDA 5050 {vehicle.version}: {who}, online and offline at {link.state_there}"
+    yield Finding("ok", _subject(link), text)
+    if not _RECOMMENDED.fullmatch(vehicle.manufacturer):
+        text = (
+            f"profile: the manufacturer {vehicle.manufacturer!r} has other characters than "
+            "letters, digits, '_', '.', ':' and '-', which are all that VDA 5050 recommends"
+        )
+        yield Finding("warning", _subject(link), text)
+    if not KINDS[link.kind].retain:
+        text = f"profile: VDA 5050 needs {link.state_there} retained"
+        yield Finding("error", _subject(link), text)
 
 
 def _is_loopback(host: str) -> bool:
