@@ -73,11 +73,6 @@ def store() -> BrokenStore:
 
 
 @pytest.fixture
-def access() -> FakeAccess:
-    return FakeAccess()
-
-
-@pytest.fixture
 def broker(access: FakeAccess, store: BrokenStore) -> Broker:
     broker = Broker(access, store, Limits(), Features())
     broker.tick(1000.0)

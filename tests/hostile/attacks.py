@@ -9,7 +9,7 @@ import math
 import random
 import socket
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 from load import BOTH, PATIENCE, ROUND_TRIP, USER, Attack, Line, Load, WebLine, encode4, encode5
@@ -1114,17 +1114,20 @@ async def retained_deep(load: Load) -> None:
     await load.together(*(publish(number) for number in range(6)))
 
 
+async def _retain(load: Load, share: float, packets: Iterator[Publish]) -> None:
+    """As many of them as that share of the time allows."""
+    publisher = await load.join("retain")
+    while load.within(share) and (some := list(itertools.islice(packets, 500))):
+        await publisher.send(encode5(*some))
+        load.counts["retained"] += len(some)
+
+
 @attack(rf"{CLIENT}")
 async def retained_replays(load: Load) -> None:
     """Clients that ask for all retained messages again and again, with every QoS."""
-    publisher = await load.join("retain")
-    for start in range(0, 10_000, 500):
-        if not load.within(0.4):
-            break
-        numbers = range(start, start + 500)
-        packets = [Publish(f"{AREA}/{n % 10}/{n}", b"x" * 50, retain=True) for n in numbers]
-        await publisher.send(encode5(*packets))
-        load.counts["retained"] += 500
+    await _retain(
+        load, 0.4, (Publish(f"{AREA}/{n % 10}/{n}", b"x" * 50, retain=True) for n in range(10_000))
+    )
 
     async def ask(number: int) -> None:
         line = await load.join(f"replay-{number}")
@@ -1142,14 +1145,7 @@ async def retained_replays(load: Load) -> None:
 @attack(rf"{CLIENT}")
 async def retained_needles(load: Load) -> None:
     """Filters whose search goes through all retained messages and finds none."""
-    publisher = await load.join("retain")
-    for start in range(0, 15_000, 500):
-        if not load.within(0.5):
-            break
-        numbers = range(start, start + 500)
-        packets = [Publish(f"{AREA}/{n}/a/b", b"x", retain=True) for n in numbers]
-        await publisher.send(encode5(*packets))
-        load.counts["retained"] += 500
+    await _retain(load, 0.5, (Publish(f"{AREA}/{n}/a/b", b"x", retain=True) for n in range(15_000)))
 
     async def ask(number: int) -> None:
         line = await load.join(f"needle-{number}")

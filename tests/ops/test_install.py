@@ -26,6 +26,10 @@ COMMAND = Path("usr/local/bin/appliance")
 UNIT = Path("etc/systemd/system/appliance.service")
 UID = 4321
 
+as_root = pytest.mark.skipif(
+    os.geteuid() != 0, reason="gives files to another user, as root only may"
+)
+
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
@@ -51,9 +55,8 @@ def install(image: Path, source: Path, **options: object) -> dict[str, str]:
     return {step.subject: step.verb for step in steps if not isinstance(step, Credentials)}
 
 
+@as_root
 def test_into_an_image_and_again(image: Path, tmp_path: Path) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     done = install(image, single_file(tmp_path), robot="r2d2")
     assert set(done.values()) == {"made"}
     uid = int(
@@ -106,10 +109,9 @@ def test_into_an_image_and_again(image: Path, tmp_path: Path) -> None:
     assert list(ServiceInstaller(Path("/", COMMAND), root=image).uninstall(purge=True)) == []
 
 
+@as_root
 def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
     """What the service's user has put into its folder must not make root give anything away."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     secret = tmp_path / "shadow"
     secret.touch()
     home = image / "etc/appliance"
@@ -120,13 +122,12 @@ def test_a_link_is_not_followed(image: Path, tmp_path: Path) -> None:
     assert secret.stat().st_uid == os.geteuid()
 
 
+@as_root
 @pytest.mark.parametrize(
     "place", ["usr/local/bin", "etc/systemd/system", "etc/default", "run", "var/lib"]
 )
 def test_an_image_does_not_lead_out_of_itself(image: Path, tmp_path: Path, place: str) -> None:
     """A link in it with a path from the top means the image's own, and led to this computer's."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     outside = tmp_path / "outside"
     outside.mkdir()
     (image / place).parent.mkdir(parents=True, exist_ok=True)
@@ -136,10 +137,9 @@ def test_an_image_does_not_lead_out_of_itself(image: Path, tmp_path: Path, place
     assert list(outside.iterdir()) == [] and not (image / "etc/appliance").exists()
 
 
+@as_root
 @pytest.mark.parametrize("line", [b"\n", b"+\n", b"jos\xe9:x:1:1:Jos\xe9:/:\n"])
 def test_odd_lines_in_a_list_of_users(image: Path, tmp_path: Path, line: bytes) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     for name in ("passwd", "group"):
         file = image / "etc" / name
         file.write_bytes(line + file.read_bytes())
@@ -147,12 +147,11 @@ def test_odd_lines_in_a_list_of_users(image: Path, tmp_path: Path, line: bytes) 
     assert "User=robot\nGroup=drivers\n" in (image / UNIT).read_text()
 
 
+@as_root
 def test_one_that_looks_as_another_ends(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also when the first ends just between the steps of the second's look at its lock."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     first, second = (ServiceInstaller(Path("/", COMMAND), root=image)._alone() for _ in range(2))
     first.__enter__()
     with pytest.raises(InstallError, match=r"another .* is at work"):
@@ -168,10 +167,9 @@ def test_one_that_looks_as_another_ends(
     install(image, single_file(tmp_path))
 
 
+@as_root
 def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) -> None:
     """The service may write its configuration, which must not lead an upgrade elsewhere."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
     home, outside = image / "etc/appliance", tmp_path / "cron.d"
     outside.mkdir()
@@ -191,11 +189,10 @@ def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) 
         install(image, single_file(tmp_path, 3))
 
 
+@as_root
 def test_cut_off_while_it_hands_over(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     chown, left = os.chown, [3]
 
     def cut_off(*arguments: Any, **options: Any) -> None:
@@ -214,12 +211,11 @@ def test_cut_off_while_it_hands_over(
     assert home.stat().st_uid != os.geteuid()
 
 
+@as_root
 def test_an_upgrade_of_the_package_keeps_the_user_of_the_units_changes(
     image: Path, tmp_path: Path
 ) -> None:
     """What README says: `systemctl edit` with another user, and its files handed to that."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
 
     def configure() -> None:
         list(ServiceInstaller(Path("/usr/bin/appliance"), root=image, packaged=True).install())
@@ -236,10 +232,9 @@ def test_an_upgrade_of_the_package_keeps_the_user_of_the_units_changes(
     assert {path.stat().st_uid for path in files} == {UID}
 
 
+@as_root
 def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
     """A system that is mounted read-only has its configuration on another disk."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     disk = image / "data"
     disk.mkdir()
     (image / "etc/appliance").symlink_to("../data")
@@ -257,9 +252,8 @@ def test_a_folder_that_is_a_link(image: Path, tmp_path: Path) -> None:
         install(image, single_file(tmp_path))
 
 
+@as_root
 def test_two_at_once(image: Path, tmp_path: Path) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     first = ServiceInstaller(Path("/", COMMAND), single_file(tmp_path), image).install()
     next(first)
     with pytest.raises(InstallError, match="another `appliance install` is at work"):
@@ -270,12 +264,11 @@ def test_two_at_once(image: Path, tmp_path: Path) -> None:
     install(image, single_file(tmp_path, 2))
 
 
+@as_root
 def test_interrupted_it_is_as_before(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C while the new version is started, which may not run at all."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
 
     def interrupted(self: ServiceInstaller) -> None:
@@ -289,12 +282,11 @@ def test_interrupted_it_is_as_before(
     assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
 
 
+@as_root
 def test_interrupted_at_the_restart_the_version_before_is_started(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """systemd goes on with what it was told, and would run a version that is not there any more."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
     restarted: list[str] = []
 
@@ -311,10 +303,9 @@ def test_interrupted_at_the_restart_the_version_before_is_started(
     assert restarted == [single_file(tmp_path, 2).read_text(), single_file(tmp_path).read_text()]
 
 
+@as_root
 def test_a_full_disk(image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told of the file that could not be written, not of the one that was read."""
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
 
     def full(source: Path, target: Path) -> None:
@@ -328,9 +319,8 @@ def test_a_full_disk(image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert [path.name for path in (image / COMMAND).parent.iterdir()] == ["appliance"]
 
 
+@as_root
 def test_the_variables_are_not_for_everyone(image: Path, tmp_path: Path) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
     assert not (image / "etc/default/appliance").stat().st_mode & 0o007
 
@@ -359,9 +349,8 @@ def test_a_dry_run_changes_nothing(image: Path, tmp_path: Path) -> None:
     assert sorted(image.rglob("*")) == before
 
 
+@as_root
 def test_for_several_robots_no_keys_are_made(image: Path, tmp_path: Path) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path), initialise=False)
     assert (image / UNIT).exists() and not (image / "etc/appliance").exists()
 
@@ -421,11 +410,10 @@ def run_script(image: Path, name: str, *arguments: str, fails: str = "") -> list
     return [line.removeprefix(f"{image}/") for line in lines]
 
 
+@as_root
 def test_a_disk_that_is_mounted_there_does_not_keep_it_from_being_purged(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     programs, data = image / "programs", image / "var/lib/appliance"
     programs.mkdir()
     busy = f'#!/bin/sh\ncase "$*" in *{data}) exit 1;; esac\nexec /bin/rm "$@"\n'
@@ -486,9 +474,8 @@ def test_to_purge_the_package_leaves_what_was_installed_by_hand_since(image: Pat
     run_script(image, "postrm", "purge")
 
 
+@as_root
 def test_what_a_sourced_ros_says_is_taken_over(image: Path, tmp_path: Path) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     shell = {"ROS_DOMAIN_ID": "7", "ROS_DISTRO": "nowhere", "RMW_IMPLEMENTATION": "a\nb"}
     install(image, single_file(tmp_path), environment=shell)
     lines = (image / "etc/default/appliance").read_text().splitlines()
@@ -561,11 +548,10 @@ def test_the_first_configuration_is_one(tmp_path: Path) -> None:
     }
 
 
+@as_root
 def test_a_dry_run_of_who_may_not_look(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if os.geteuid():
-        pytest.skip("gives files to another user, as root only may")
     install(image, single_file(tmp_path))
     exists = Path.exists
 

@@ -348,13 +348,17 @@ class Scenarios:
                 problems[client.index] = "what is new does not move it"
         return [client.outcome(scenario, problems.get(client.index, "")) for client in self.clients]
 
-    async def restart(self, how):
-        """The appliance is started anew, while its clients steer on and stop then."""
+    async def _steer(self):
+        """Clients connect and move the robot, and steer on for STEERED_ON seconds more."""
         await self._connect()
         for client in self.clients:
             client.do("drive", int(RATE * (1 + STEERED_ON)), RATE)
         await until(lambda: all(client.moved for client in self.clients), "the robot is moved")
         await asyncio.sleep(0.5)
+
+    async def restart(self, how):
+        """The appliance is started anew, while its clients steer on and stop then."""
+        await self._steer()
         await self.robot.end(how)
         await self._all_done(1)
         await asyncio.sleep(AWAY)
@@ -373,11 +377,7 @@ class Scenarios:
 
     async def network_gone(self):
         """Connections are lost, and for a time there are none."""
-        await self._connect()
-        for client in self.clients:
-            client.do("drive", int(RATE * (1 + STEERED_ON)), RATE)
-        await until(lambda: all(client.moved for client in self.clients), "the robot is moved")
-        await asyncio.sleep(0.5)
+        await self._steer()
         await self.robot.network.cut()
         await self._all_done(1)
         await asyncio.sleep(AWAY)
@@ -388,11 +388,7 @@ class Scenarios:
 
     async def network_stalls(self):
         """Connections live, and nothing gets through for a time."""
-        await self._connect()
-        for client in self.clients:
-            client.do("drive", int(RATE * (1 + STEERED_ON)), RATE)
-        await until(lambda: all(client.moved for client in self.clients), "the robot is moved")
-        await asyncio.sleep(0.5)
+        await self._steer()
         self.robot.network.flowing.clear()
         await self._all_done(1)
         await asyncio.sleep(AWAY / 2)

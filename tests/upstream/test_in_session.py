@@ -285,11 +285,15 @@ def test_a_retained_message_is_a_state_and_no_command(rig: Rig) -> None:
 # --- acknowledgements --------------------------------------------------------------------------
 
 
-def test_acknowledgements_wait_for_their_commit_in_order(rig: Rig) -> None:
-    store = rig.store
-    assert isinstance(store, FakeStore)
-    reader = rig.join("reader", **lasting(5))
-    reader.subscribe("r2/mission/#", 1)
+@pytest.fixture
+def store(rig: Rig) -> FakeStore:
+    """Messages on r2/mission/# are stored here, for a reader whose session outlives it."""
+    assert isinstance(rig.store, FakeStore)
+    rig.join("reader", **lasting(5)).subscribe("r2/mission/#", 1)
+    return rig.store
+
+
+def test_acknowledgements_wait_for_their_commit_in_order(rig: Rig, store: FakeStore) -> None:
     fleet = rig.connect()
     store.holding = True
     ids = [
@@ -309,11 +313,7 @@ def test_acknowledgements_wait_for_their_commit_in_order(rig: Rig) -> None:
     assert fleet.connection.codes() == [(ids[5], 0), (ids[6], 0)]
 
 
-def test_what_depends_on_nothing_stored_is_acknowledged_at_once(rig: Rig) -> None:
-    store = rig.store
-    assert isinstance(store, FakeStore)
-    reader = rig.join("reader", **lasting(5))
-    reader.subscribe("r2/mission/#", 1)
+def test_what_depends_on_nothing_stored_is_acknowledged_at_once(rig: Rig, store: FakeStore) -> None:
     fleet = rig.connect()
     store.holding = True
     publisher = rig.join("other")
@@ -321,11 +321,7 @@ def test_what_depends_on_nothing_stored_is_acknowledged_at_once(rig: Rig) -> Non
     assert fleet.send("fleet/r2/calls/1") == 0
 
 
-def test_a_commit_that_fails_ends_the_connection_unacknowledged(rig: Rig) -> None:
-    store = rig.store
-    assert isinstance(store, FakeStore)
-    reader = rig.join("reader", **lasting(5))
-    reader.subscribe("r2/mission/#", 1)
+def test_a_commit_that_fails_ends_the_connection_unacknowledged(rig: Rig, store: FakeStore) -> None:
     fleet = rig.connect()
     store.holding = True
     assert fleet.send("fleet/r2/mission/1") == -1
@@ -342,12 +338,8 @@ def test_a_commit_that_fails_ends_the_connection_unacknowledged(rig: Rig) -> Non
     [(V5, False, FULL), (V5, True, None), (V311, False, None)],
 )
 def test_while_the_store_fails_nothing_is_acknowledged_that_is_not_stored(
-    rig: Rig, version: int, is_kept: bool, code: int | None
+    rig: Rig, store: FakeStore, version: int, is_kept: bool, code: int | None
 ) -> None:
-    store = rig.store
-    assert isinstance(store, FakeStore)
-    reader = rig.join("reader", **lasting(5))
-    reader.subscribe("r2/mission/#", 1)
     ear = hear(rig, "r2/cmd_vel")
     store.holding = True
     store._stage()
@@ -359,11 +351,7 @@ def test_while_the_store_fails_nothing_is_acknowledged_that_is_not_stored(
     assert bool(fleet.connection.closed) is (code is None)
 
 
-def test_nothing_is_acknowledged_on_another_connection(rig: Rig) -> None:
-    store = rig.store
-    assert isinstance(store, FakeStore)
-    reader = rig.join("reader", **lasting(5))
-    reader.subscribe("r2/mission/#", 1)
+def test_nothing_is_acknowledged_on_another_connection(rig: Rig, store: FakeStore) -> None:
     first = rig.connect()
     store.holding = True
     first.put("fleet/r2/mission/1")
