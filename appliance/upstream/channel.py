@@ -166,6 +166,11 @@ class Channel:
         self._finish()
 
     @property
+    def filters(self) -> list[str]:
+        """The topic filters that it subscribes to."""
+        return [each.filter for each in self._subscriptions]
+
+    @property
     def client_id(self) -> str:
         """The client id there: the broker may have assigned another one."""
         granted = self.connection.granted

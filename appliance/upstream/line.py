@@ -27,7 +27,7 @@ from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
 from appliance.upstream.limits import KINDS, alpn
 from appliance.upstream.presence import Presence
-from appliance.upstream.refusals import ending_advice
+from appliance.upstream.refusals import ending_advice, unanswered_filters
 from appliance.upstream.transport import UpstreamTransport
 from appliance.upstream.versions import ServerVersions
 
@@ -305,6 +305,8 @@ class Line:
             advice = ending_advice(
                 ending, self._settings, self._settings.servers[server], self._client_id
             )
+            if ending.is_close and not ending.is_new and not channel.is_subscribed:
+                advice = unanswered_filters(channel.filters)
             return self._failed(f"{ending.text}; {advice}" if advice else ending.text)
         text = ending.text
         if self._backoff.is_contested(now):

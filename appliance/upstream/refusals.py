@@ -7,6 +7,7 @@ was refused. What the broker's answer leaves open is said as open.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from appliance.config.urls import ServerUrl
@@ -14,6 +15,9 @@ from appliance.mqtt.codec import V5, quote
 from appliance.mqtt.reason import ReasonCode, connack_v311
 from appliance.upstream.agreement import EndedBy, Ending
 from appliance.upstream.rules import UpstreamSettings
+
+#: Topic filters that a text names, at most.
+SHOWN_FILTERS: Final = 8
 
 #: Where only the broker knows why.
 _ITS_LOG: Final = "the log of the fleet's broker says why"
@@ -68,6 +72,15 @@ def ending_advice(
     else:
         advice = _disconnect_advice(code, settings, client_id)
     return advice or _ADVICE.get(code, _ITS_LOG)
+
+
+def unanswered_filters(filters: Sequence[str]) -> str:
+    """The broker has closed the connection in place of an answer to SUBSCRIBE.
+
+    RabbitMQ does that to a login that may not subscribe to one of the filters.
+    """
+    shown = ", ".join(map(quote, filters[:SHOWN_FILTERS]))
+    return f"it has answered nothing to SUBSCRIBE: may this login subscribe to {shown}?"
 
 
 def _unanswered(settings: UpstreamSettings, server: ServerUrl) -> str:

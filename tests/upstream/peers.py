@@ -384,10 +384,26 @@ class RabbitMQ(Peer):
             self.erlang.stop()
 
 
+#: May publish below `fleet/r2d2/events/`, but not `secret`, and to the state of the link, and
+#: subscribe to `fleet/r2d2/cmd/#`. In topics RabbitMQ has a dot for a slash.
+LIMITED = "limited"
+
 _DEFINITIONS = {
-    "users": [{"name": USER, "password": PASSWORD, "tags": ""}],
+    "users": [{"name": user, "password": PASSWORD, "tags": ""} for user in (USER, LIMITED)],
     "vhosts": [{"name": "/"}],
-    "permissions": [{"user": USER, "vhost": "/", "configure": ".*", "write": ".*", "read": ".*"}],
+    "permissions": [
+        {"user": user, "vhost": "/", "configure": ".*", "write": ".*", "read": ".*"}
+        for user in (USER, LIMITED)
+    ],
+    "topic_permissions": [
+        {
+            "user": LIMITED,
+            "vhost": "/",
+            "exchange": "amq.topic",
+            "write": r"^fleet\.r2d2\.(events\.(?!secret)|_appliance\.)",
+            "read": r"^fleet\.r2d2\.cmd\.",
+        }
+    ],
     "policies": [
         {
             "vhost": "/",
@@ -483,6 +499,12 @@ class Ejabberd(Peer):
         folder = f'"{self.directory}/spool"'
         start = ["-mnesia", "dir", folder, "-s", "ejabberd", "-eval", register]
         return [self._program, "-noinput", *_MODEST.split(), *start]
+
+    def start(self) -> None:
+        super().start()
+        process = self._process
+        # It may listen a little after that, when it reads what it had stored.
+        _wait_for_port(self.plain_port, lambda: process is not None and process.poll() is None)
 
 
 class Tinyproxy(Peer):

@@ -21,7 +21,6 @@ from upstream.peers import (
     Haproxy,
     MosquittoBridge,
     Peer,
-    RabbitCluster,
     RabbitMQ,
     Tinyproxy,
 )
@@ -95,24 +94,6 @@ async def until_arrives(sender: MqttClient, topic: str, receiver: MqttClient) ->
 
 async def test_rabbitmq(rabbitmq: RabbitMQ) -> None:
     await exchange(rabbitmq.plain_port, V311)
-
-
-@pytest.mark.timeout(300)
-async def test_a_cluster_of_rabbitmq_goes_on_without_one_node(tmp_path: Path) -> None:
-    with RabbitCluster(tmp_path) as cluster:
-        first, second, third = cluster.nodes
-        reader = await MqttClient.dial(second.plain_port, "reader", version=V311, clean=False)
-        await reader.subscribe("a/#")
-        writer = await MqttClient.dial(third.plain_port, "writer", version=V311)
-        await writer.publish("a/b", b"1")
-        await reader.wait_for(1)
-        killed = family(first)
-        first.kill()
-        await until(lambda: gone(killed))
-        await writer.publish("a/b", b"2")
-        await reader.wait_for(2)
-        pids = [*family(second), *family(third)]
-    await until(lambda: gone(pids))
 
 
 async def test_ejabberd(tmp_path: Path) -> None:
