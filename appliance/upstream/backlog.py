@@ -6,7 +6,10 @@ of them is next, what is dropped when the backlog is full, and what is in memory
 
 - messages that were handed out, at most `IN_FLIGHT_SIZE` bytes;
 - the next ones of each journal, `LOADED_SIZE` for all rules; the others are on disk alone;
-- the latest ones of topics, and those that are forgotten when the connection ends, `LIVE_SIZE`.
+- the latest ones of topics, `LATEST_SIZE`, and with those that are forgotten when the connection
+  ends, `LIVE_SIZE`. A latest one that has no room there is in its rule's journal, and dropped from
+  there when a newer one of its topic has come; what is in memory of it is its topic, see
+  `Overflow`.
 
 A single message may exceed each of these, as it could not be sent otherwise.
 
@@ -55,6 +58,7 @@ MIB: Final = 1024 * KIB
 #: for other reasons. With what a higher lane gets in addition it is 8 MiB a link.
 IN_FLIGHT_SIZE: Final = 3 * MIB
 LOADED_SIZE: Final = 5 * MIB // 4
+LATEST_SIZE: Final = 3 * MIB
 LIVE_SIZE: Final = 7 * MIB // 2
 
 #: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
@@ -299,6 +303,8 @@ class Backlog:
             queue.stored = sum(segment.count - segment.done for segment in segments)
             self._count(queue, queue.stored, sum(map(size_left, segments)))
             queue.behind = queue.stored > 0
+            if queue.stored:
+                queue.note_restored(self._number)
         for record, size, key in sorted(later, key=lambda each: each[0].number):
             entry = Entry(self._orphaned(record.rule), record, size)
             entry.key = key
@@ -384,9 +390,17 @@ class Backlog:
                 break
             if not self._make_room(queue.lane, added, now):
                 return self._refuse(queue)
-        if kept == "latest" and qos and queue.may_store(topic):
-            kept = "all"  # it may not overtake an older message of its topic
-        if kept == "all":
+        overflows = False
+        if kept == "latest":
+            if queue.overflows(topic) or not self._has_latest_room(queue, topic, size):
+                overflows = True
+            elif qos and queue.may_store(topic):
+                kept = "all"  # it may not overtake an older message of its topic
+        if overflows:
+            if self._backlogs.failing:
+                return self._cannot_store(queue, qos)
+            self._append_latest(queue, topic, data, number, awaited=qos > 0)
+        elif kept == "all":
             if self._backlogs.failing:
                 return self._cannot_store(queue, qos)
             if queue.latest and topic in queue.latest:
@@ -395,9 +409,7 @@ class Backlog:
         elif kept == "latest":
             if (qos or retain) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
-            if not self._offer_latest(queue, topic, data, persistent=qos > 0 or retain, qos=qos):
-                self._drop(queue, DropReason.FULL)
-                return None
+            self._offer_latest(queue, topic, data, persistent=qos > 0 or retain, qos=qos)
         else:
             memory = size + LOADED_OVERHEAD
             if not self._make_live_room(queue.lane, memory):
@@ -437,7 +449,7 @@ class Backlog:
 
     def _append(
         self, queue: RuleQueue, topic: str, data: bytes, number: int, *, awaited: bool
-    ) -> None:
+    ) -> Segment:
         journal = queue.journal
         if journal is None:
             self._open_journal(queue)
@@ -457,6 +469,7 @@ class Backlog:
         else:
             queue.arriving = None
             queue.spill(segment)
+        return segment
 
     def _has_memory(self, queue: RuleQueue, size: int) -> bool:
         """Whether a record of this size may be read now."""
@@ -469,10 +482,41 @@ class Backlog:
 
     # --- the latest of a topic --------------------------------------------------------------------
 
+    def _has_latest_room(self, queue: RuleQueue, topic: str, size: int) -> bool:
+        """Whether there is memory for a record of this size as the latest of its topic."""
+        place = queue.latest.get(topic)
+        before = 0 if place is None else len(place[0]) + LATEST_OVERHEAD
+        return self._live_size - before + size + LATEST_OVERHEAD <= LATEST_SIZE
+
     def _offer_latest(
         self, queue: RuleQueue, topic: str, data: bytes, *, persistent: bool, qos: int
-    ) -> bool:
-        """Keep it as the latest of its topic, in place of an older one; False without memory."""
+    ) -> None:
+        """Keep it as the latest of its topic, in place of an older one."""
+        key = self._replace_latest(queue, topic)
+        if persistent or key is not None:
+            key = self._latest.put(key, _LATEST + data, awaited=qos > 0)
+        self._keep_latest(queue, topic, data, key)
+
+    def _append_latest(
+        self, queue: RuleQueue, topic: str, data: bytes, number: int, *, awaited: bool
+    ) -> None:
+        """Store it as the latest of its topic in the journal, in place of an older one."""
+        key = self._replace_latest(queue, topic)
+        queue.latest.pop(topic, None)
+        if key is not None:
+            self._latest.remove(key)
+        segment = self._append(queue, topic, data, number, awaited=awaited)
+        queue.note_topic(topic, number)
+        replaced = queue.overflow.note(topic, number, segment.key)
+        if replaced is None or not queue.behind:
+            return
+        assert queue.journal is not None
+        outdated = queue.overflow.outdated(replaced, queue.journal.segments())
+        if outdated is not None and queue.is_unread(outdated):
+            self._drop_unread(queue, outdated, DropReason.REPLACED)
+
+    def _replace_latest(self, queue: RuleQueue, topic: str) -> int | None:
+        """A newer message of the topic has come: end the older one; returns the key of its row."""
         key: int | None = None
         place = queue.latest.get(topic)
         if place is not None:
@@ -485,15 +529,7 @@ class Backlog:
             key, before.key = before.key, None  # the row becomes the newer message's
             if before.state in (AGAIN, LATER):
                 self._discard(before, DropReason.REPLACED)
-        if not self._make_live_room(queue.lane, len(data) + LATEST_OVERHEAD, queue, topic):
-            queue.latest.pop(topic, None)
-            if key is not None:
-                self._latest.remove(key)
-            return False
-        if persistent or key is not None:
-            key = self._latest.put(key, _LATEST + data, awaited=qos > 0)
-        self._keep_latest(queue, topic, data, key)
-        return True
+        return key
 
     def _keep_latest(self, queue: RuleQueue, topic: str, data: bytes, key: int | None) -> None:
         queue.latest[topic] = data, key
@@ -591,25 +627,24 @@ class Backlog:
             self._uncount(queue, len(data))
         self._drop(queue, reason)
 
-    def _make_live_room(
-        self, lane: int, memory: int, sparing: RuleQueue | None = None, topic: str = ""
-    ) -> bool:
-        """Drop what is only in memory, or the latest of topics, until so many bytes have room.
+    def _make_live_room(self, lane: int, memory: int) -> bool:
+        """Drop what is forgotten with the connection until so many bytes have room.
 
-        As for `_make_room`. The place of the topic, whose message is being replaced, is kept.
+        As for `_make_room`.
         """
         if self._live_size + memory <= LIVE_SIZE:
             return True
-        if sparing is not None and topic in sparing.latest:
-            del sparing.latest[topic]
         self._say_full()
         for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            while self._live_size and self._live_size + memory > LIVE_SIZE:
-                waiting = [queue for queue in self._lanes[lowest] if queue.latest or queue.live]
+            while self._live_size + memory > LIVE_SIZE:
+                waiting = [queue for queue in self._lanes[lowest] if queue.live]
                 if not waiting:
                     break
-                oldest = min(waiting, key=lambda queue: queue.oldest_live() or 0.0)
-                self._drop_first_live(oldest, DropReason.FULL)
+                oldest = min(waiting, key=lambda queue: record_times(queue.live[0])[0])
+                data = oldest.live.popleft()
+                self._live_size -= len(data) + LOADED_OVERHEAD
+                self._uncount(oldest, len(data))
+                self._drop(oldest, DropReason.FULL)
         return not self._live_size or self._live_size + memory <= LIVE_SIZE
 
     def _say_full(self) -> None:
@@ -795,6 +830,9 @@ class Backlog:
         except ValueError as error:
             log.warning("backlog of %s: a message is unreadable: %s", self._name, error)
             reason = DropReason.UNREADABLE
+        else:
+            if queue.overflow and queue.was_replaced(record):
+                reason = DropReason.REPLACED
         if reason is not None:
             self._uncount(queue, len(data))
             self._drop(queue, reason)

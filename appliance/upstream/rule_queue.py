@@ -7,8 +7,9 @@ rate delays nobody else, and a drop is counted for it without reading what is dr
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Final
 
@@ -25,6 +26,11 @@ ENTRY_OVERHEAD: Final = 500
 
 #: Slots of the table of topics that the journal may contain, see `RuleQueue.may_store`.
 _TOPICS: Final = 4096
+
+#: Bytes of the topics of which the latest message is in the journal, and what is counted for one
+#: beside its text.
+OVERFLOW_SIZE: Final = 16 << 20
+OVERFLOW_OVERHEAD: Final = 300
 
 # States of an entry.
 IN_FLIGHT: Final = 0
@@ -91,6 +97,71 @@ class Entry:
         self.topic: str | None = None
 
 
+class Overflow:
+    """Which records of a journal are the latest ones of their topics: those without room elsewhere.
+
+    Of a topic that has no room here either, at most `OVERFLOW_SIZE`, all messages are sent.
+    """
+
+    def __init__(self) -> None:
+        #: By topic: the number of the record, and the key of its segment when it was appended.
+        self._newest: dict[str, tuple[int, int]] = {}
+        self._size = 0
+        #: By segment: how many records in it count no more. The keys are in order.
+        self._replaced: dict[int, int] = {}
+        self._keys: list[int] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._newest)
+
+    def __contains__(self, topic: str) -> bool:
+        return topic in self._newest
+
+    def get(self, topic: str) -> int | None:
+        """The number of the topic's latest record."""
+        found = self._newest.get(topic)
+        return None if found is None else found[0]
+
+    def note(self, topic: str, number: int, segment: int) -> int | None:
+        """A record was appended; returns the segment of the one that it replaces, if any."""
+        before = self._newest.get(topic)
+        if before is None:
+            size = len(topic) + OVERFLOW_OVERHEAD
+            if self._size + size > OVERFLOW_SIZE:
+                return None
+            self._size += size
+        self._newest[topic] = number, segment
+        return None if before is None else before[1]
+
+    def forget(self, topic: str) -> None:
+        """The topic's latest record is being sent."""
+        if self._newest.pop(topic, None) is not None:
+            self._size -= len(topic) + OVERFLOW_OVERHEAD
+
+    def outdated(self, key: int, segments: Sequence[Segment]) -> Segment | None:
+        """One more record counts no more, which was appended to the segment with this key: the
+        segment that it is in now, when nothing in that counts any more."""
+        place = bisect_right(segments, key, key=attrgetter("key")) - 1
+        if place < 0:
+            return None
+        segment = segments[place]
+        if key not in self._replaced:
+            insort(self._keys, key)
+        self._replaced[key] = self._replaced.get(key, 0) + 1
+        # Segments that only wait are merged; the first one gives its key.
+        first = bisect_left(self._keys, segment.key)
+        end = len(self._keys)
+        if place + 1 < len(segments):
+            end = bisect_left(self._keys, segments[place + 1].key)
+        if sum(self._replaced[each] for each in self._keys[first:end]) < segment.count:
+            return None
+        for each in self._keys[:end]:  # those before it are of segments that are not there
+            if each >= segment.key or each < segments[0].key:
+                del self._replaced[each]
+        self._keys = sorted(self._replaced)
+        return segment
+
+
 class RuleQueue:
     """The messages of one rule, waiting or in flight.
 
@@ -144,6 +215,10 @@ class RuleQueue:
         #: to `emptied` are not there any more.
         self._topics: array[int] | None = None
         self._emptied = 0
+        #: Whether the journal has records from before the start, of topics that are not known.
+        self._is_restored = False
+        #: The latest ones of topics that are in the journal.
+        self.overflow = Overflow()
 
     def use(self, rule: OutRule) -> None:
         """Follow the rule as it is from now on."""
@@ -170,6 +245,36 @@ class RuleQueue:
             self.stored > 0
             and self._topics is not None
             and self._topics[hash(topic) % _TOPICS] > self._emptied
+        )
+
+    def note_restored(self, number: int) -> None:
+        """The journal has records of any topic, up to this number."""
+        self._topics = array("Q", [number]) * _TOPICS
+        self._is_restored = True
+
+    def overflows(self, topic: str) -> bool:
+        """Whether the latest message of a topic is stored in the journal as an older one of it is,
+        or may be: it may not overtake that."""
+        return topic in self.overflow or (self._is_restored and self.may_store(topic))
+
+    def was_replaced(self, record: Record) -> bool:
+        """Whether a record of the journal counts no more, as a newer one of its topic does."""
+        newest = self.overflow.get(record.topic)
+        if newest is None:
+            return False
+        if record.number >= newest:
+            self.overflow.forget(record.topic)
+            return False
+        return self.kept[2 * record.qos + record.retain] == "latest"
+
+    def is_unread(self, segment: Segment) -> bool:
+        """Whether nothing of the segment is in memory, nor will be soon."""
+        assert self.journal is not None
+        last = self.last
+        return (
+            segment is not self.reading
+            and (last is None or segment.key > last.segment.key)
+            and segment is not self.journal.segments()[-1]
         )
 
     # --- the journal ----------------------------------------------------------------------------
@@ -279,6 +384,9 @@ class RuleQueue:
     def empty(self, number: int) -> None:
         """Nothing up to this number is in the journal any more."""
         self._emptied = number
+        self._is_restored = False
+        if self.overflow:
+            self.overflow = Overflow()
 
     def drop_unread(self, segment: Segment | None) -> tuple[int, int]:
         """Drop what is not in memory of the oldest segment of which something is not: the number of

@@ -642,3 +642,60 @@ def test_rows_of_another_version_are_removed() -> None:
     assert not link.backlogs.latest_records.rows and not link.backlogs.aside_records.rows
     link.offer("1")
     assert link.drain() == ["1"]
+
+
+@pytest.mark.parametrize("when_full", ["drop-oldest", "refuse"])
+def test_the_latest_of_more_topics_than_memory_has_room_for(when_full: str) -> None:
+    link = Link(rule(keep="latest"), online=False, when_full=when_full)
+    topics = [f"t{number}" for number in range(12)]
+    for turn in range(4):
+        for topic in topics:
+            assert link.offer(f"{topic} {turn}".ljust(500_000), topic) is None
+        link.backlogs.commit()
+    # What a newer one has replaced does not stay on disk: of 24 MB the latest 6, and what is read.
+    assert link.counts().bytes < 14_000_000
+    sent = [each.rstrip() for each in link.drain()]
+    assert sorted(sent) == sorted(f"{topic} 3" for topic in topics)
+    assert link.dropped() == {"replaced": 36}
+    assert link.counts().waiting == link.counts().bytes == 0
+    # It is over: the next ones wait in memory again.
+    link.offer("a", "t0")
+    link.offer("b", "t0")
+    assert link.drain() == ["b"]
+
+
+def test_refuse_refuses_the_latest_and_drops_none() -> None:
+    link = Link(rule(keep="latest"), online=False, size=5_000_000, when_full="refuse")
+    found = [link.offer("x".ljust(500_000), f"t{number}") for number in range(12)]
+    assert found[:9] == [None] * 9
+    assert all(str(each).endswith("is full") for each in found[9:]) and len(found[9:]) == 3
+    assert len(link.drain()) == 9
+
+
+def test_after_a_restart_the_latest_does_not_overtake_an_older_one() -> None:
+    link = Link(rule(keep="latest"), online=False)
+    for number in range(12):
+        link.offer(f"old {number}".ljust(500_000), f"t{number}")
+    link.backlogs.commit()
+    link.restart()
+    for number in range(12):
+        link.offer(f"new {number}", f"t{number}")
+    sent = [each.rstrip() for each in link.drain()]
+    for number in range(12):
+        of_topic = [each for each in sent if each.split()[1] == str(number)]
+        assert of_topic in ([f"new {number}"], [f"old {number}", f"new {number}"])
+
+
+def test_merged_segments_are_dropped_when_all_in_them_was_replaced() -> None:
+    link = Link(rule(keep="latest"), online=False)
+    for number in range(12):  # no room for any more
+        link.offer("x".ljust(500_000), f"big{number}")
+    for turn in range(3):
+        for topic in ("a", "b", "c", "d"):
+            link.offer(f"{topic}{turn}", topic)
+            link.backlogs.commit()
+            link.backlogs.journals[0].release(link.backlogs.journals[0].list[-1])
+        link.backlogs.journals[0].merge()
+    assert link.dropped() == {"replaced": 8} and link.counts().waiting == 12 + 4
+    sent = [each for each in link.drain() if not each.startswith("x")]
+    assert sent == ["a2", "b2", "c2", "d2"]

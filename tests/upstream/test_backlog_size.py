@@ -46,14 +46,14 @@ def test_the_latest_of_many_topics_are_bounded() -> None:
     link = Link(rule(), online=False)
     tracemalloc.start()
     try:
-        for number in range(6_000):
+        for number in range(20_000):
             link.offer(bytes(300), f"fleet/state/{number}", qos=0)
         taken = allocated()
     finally:
         tracemalloc.stop()
-    assert taken < 4 * MIB, taken
-    assert link.dropped()["full"] + link.counts().waiting == 6_000
-    assert link.counts().waiting > 3_000
+    # Of most of them the topic alone is in memory.
+    assert taken < 11 * MIB, taken
+    assert link.counts().waiting == 20_000
 
 
 @pytest.mark.timed
