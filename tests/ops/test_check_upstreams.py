@@ -127,6 +127,14 @@ def test_a_link_by_vda5050(here: Path) -> None:
     assert "error profile: VDA 5050 needs uagv/v2/acme & sons/r2/connection retained" in told
 
 
+def test_a_robot_by_vda5050_that_publishes_nothing(here: Path) -> None:
+    (here / "acl.conf").write_text("user upstream\ntopic readwrite {robot}/#\n")
+    profile = {"vda5050": {"manufacturer": "acme"}}
+    told = [each for each in troubles(here, profile=profile, out=[]) if "nobody publishes" in each]
+    # By the standard, `visualization` is up to the robot.
+    assert [each.split()[2] for each in told] == ["state:", "factsheet:"]
+
+
 def test_the_default_name_of_robots(here: Path) -> None:
     told = [each for each in troubles(here, robot="robot") if "robot's name" in each]
     assert len(told) == 1 and told[0].startswith("warning the robot's name is 'robot'")
