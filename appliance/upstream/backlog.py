@@ -774,6 +774,96 @@ class Backlog:
         passed[2] = passed[2] + 1 if lane != 2 else 0
         return entry
 
+    def take(self, now: float, most: int, size: int) -> list[Entry]:
+        """The next messages, at most so many, as that many calls of `next` would hand them out.
+
+        The last is the one with which they have `size` bytes. There may be more although these are
+        fewer; there is none to be sent now if these are none.
+
+        A backlog that drains has one rule whose messages wait, and most are found without looking
+        at all rules and lanes: that takes half the time of `next`.
+        """
+        queue, most = self._only_queue(most)
+        if queue is None or most < 2:
+            entry = self.next(now)
+            return [] if entry is None else [entry]
+        lane, waiting, flying = queue.lane, queue.waiting, self._flying
+        entries: list[Entry] = []
+        pop, decode, age = queue.pop_waiting, Record.decode, self._limits.age
+        memory = self._flying_size + self._again_size
+        while len(entries) < most and size > 0 and memory < IN_FLIGHT_SIZE and waiting:
+            try:
+                record = decode(waiting[0])
+            except ValueError:
+                break  # it is for `next` to tell
+            stored_at, expires_at = record.stored_at, record.expires_at
+            if expires_at is not None and expires_at <= now:
+                break  # to drop it, too
+            if age is not None and stored_at + age <= now:
+                break
+            data, part, index = pop()
+            length = len(data)
+            entry = Entry(queue, record, length)
+            entry.part = part
+            entry.index = index
+            entry.attempts = 1
+            if now - stored_at > DELAYED:
+                entry.published_at = stored_at
+            if expires_at is not None:
+                entry.expiry = min(_LONGEST_EXPIRY, math.ceil(expires_at - now))
+            flying[record.number] = entry
+            memory += length + ENTRY_OVERHEAD
+            self._flying_size += length + ENTRY_OVERHEAD
+            size -= length
+            entries.append(entry)
+        if not entries:
+            entry_of_next = self.next(now)
+            return [] if entry_of_next is None else [entry_of_next]
+        if self._oversized is queue:
+            self._oversized = None
+        self._live_first[lane] = True
+        for other in (1, 2):
+            self._passed[other] = self._passed[other] + len(entries) if other != lane else 0
+        return entries
+
+    def _only_queue(self, most: int) -> tuple[RuleQueue | None, int]:
+        """The rule whose read messages are the next ones, and how many of them may be."""
+        if (
+            self._bucket is not None
+            or self._byte_bucket is not None
+            or self._later_count
+            or self._repeated
+        ):
+            return None, 0
+        found: RuleQueue | None = None
+        for queues in self._lanes:
+            for queue in queues:
+                if queue.waiting or queue.again or queue.latest or queue.live or queue.behind:
+                    if found is None:
+                        found = queue
+                    elif found.lane == queue.lane:
+                        return None, 0  # whichever has the older message
+        if (
+            found is None
+            or found.again
+            or found.latest
+            or found.live
+            or found.bucket is not None
+            or (found.behind and found.reading is None and 2 * found.loaded <= self._share)
+        ):
+            return None, 0
+        for lane in (1, 2):
+            if lane != found.lane:
+                most = min(most, TURN - self._passed[lane])
+        return found, most
+
+    def put_back(self, entries: Iterable[Entry]) -> None:
+        """They were handed out, and not sent: they are the next ones again."""
+        for entry in reversed(list(entries)):
+            self._land(entry)
+            self._again_size += entry.size + ENTRY_OVERHEAD
+            self._put_back(entry)
+
     def _next_of(self, lane: int, now: float, only_again: bool) -> Entry | None:
         """The next message of a lane, handed out; it drops those that are too old."""
         for _ in range(MOST_DROPPED):
@@ -1009,6 +1099,47 @@ class Backlog:
         self._land(entry)
         self._end(entry)
 
+    def settle_all(self, entries: Iterable[Entry]) -> None:
+        """`settle` for each of them.
+
+        Acknowledgements come in the order of the messages, so that those of a segment are settled
+        at once: the journal is told only of the last.
+        """
+        flying = self._flying
+        part: HeldSegment | None = None
+        queue: RuleQueue | None = None
+        count = size = 0
+        for entry in entries:
+            found = entry.part
+            if (
+                found is None
+                or entry.index != found.done
+                or found.settled
+                or entry.state != IN_FLIGHT
+            ):
+                self.settle(entry)
+                continue
+            if found is not part:
+                if part is not None and queue is not None:
+                    self._settled(queue, part, count, size)
+                part, queue = found, entry.queue
+                count = size = 0
+            found.done += 1
+            entry.state = GONE
+            del flying[entry.record.number]
+            count += 1
+            size += entry.size
+        if part is not None and queue is not None:
+            self._settled(queue, part, count, size)
+
+    def _settled(self, queue: RuleQueue, part: HeldSegment, count: int, size: int) -> None:
+        """So many records of a segment, of `size` bytes in all, were in flight, and are settled."""
+        self._counts.sent += count
+        self._flying_size -= size + count * ENTRY_OVERHEAD
+        self._count(queue, -count, -size)
+        queue.settled(part, count)
+        self._check_emptied(queue)
+
     def retry_later(self, entry: Entry, now: float) -> None:
         """The fleet's broker has no room for it (0x97): it is sent again after a while.
 
@@ -1052,15 +1183,8 @@ class Backlog:
         self._flying.clear()
         self._flying_size = 0
         for entry in reversed(flying):
-            queue = entry.queue
-            entry.state = AGAIN
             self._again_size += entry.size + ENTRY_OVERHEAD
-            if entry.topic is not None and self._is_replaced(entry):
-                self._discard(entry, DropReason.REPLACED)
-            elif not _is_kept(entry):
-                self._discard(entry, DropReason.OFFLINE)
-            else:
-                queue.again.appendleft(entry)
+            self._put_back(entry)
         for _, _, entry in self._later:
             if entry.state == LATER and not _is_kept(entry):
                 self._discard(entry, DropReason.OFFLINE)
@@ -1070,6 +1194,16 @@ class Backlog:
                 self._live_size -= len(data) + LOADED_OVERHEAD
                 self._uncount(queue, len(data))
                 self._drop(queue, DropReason.OFFLINE)
+
+    def _put_back(self, entry: Entry) -> None:
+        """It is not in flight any more, and is sent again before all others of its rule."""
+        entry.state = AGAIN
+        if entry.topic is not None and self._is_replaced(entry):
+            self._discard(entry, DropReason.REPLACED)
+        elif not _is_kept(entry):
+            self._discard(entry, DropReason.OFFLINE)
+        else:
+            entry.queue.again.appendleft(entry)
 
     def _is_replaced(self, entry: Entry) -> bool:
         """Whether a newer message of its topic waits or is in flight."""

@@ -374,6 +374,12 @@ class RuleQueue:
         assert self.journal is not None
         self.journal.settle(part.segment, part.done)
 
+    def settled(self, part: HeldSegment, count: int) -> None:
+        """The last so many records before `part.done` need to be sent no more."""
+        self.stored -= count
+        assert self.journal is not None
+        self.journal.settle(part.segment, part.done)
+
     def _advance(self, part: HeldSegment) -> None:
         done = part.done
         while done in part.settled:

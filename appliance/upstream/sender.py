@@ -5,25 +5,15 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from datetime import datetime, timezone
 from typing import Final
 
-from appliance.mqtt.codec import (
-    NO_PROPERTIES,
-    V5,
-    Properties,
-    Property,
-    decode_varint,
-    encode_property_list,
-    encode_varint,
-    quote,
-    reason_name,
-)
+from appliance.mqtt.codec import NO_PROPERTIES, V5, quote, reason_name
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream.agreement import EndedBy, Ending
 from appliance.upstream.backlog import Backlog
 from appliance.upstream.limits import FleetLimits
 from appliance.upstream.link import FleetConnection
+from appliance.upstream.publish_properties import PublishProperties
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.transport import WRITE_PORTION
 
@@ -65,8 +55,8 @@ PATIENCE: Final = 1000
 CLOSED_ON: Final = 3
 WITHOUT_PROGRESS: Final = 2
 
-_ID: Final = "id"
-_PUBLISHED_AT: Final = "published-at"
+#: Topics of which it is known whether they can be sent; with more, all are forgotten.
+KNOWN_TOPICS: Final = 1024
 
 
 class Sender:
@@ -92,24 +82,38 @@ class Sender:
         #: Messages to be acknowledged until the rest of the suspects, which were dropped, is
         #: forgotten.
         self._patience = 0
+        self._properties = PublishProperties()
+        #: By topic: its bytes, and why it cannot be used there. Most messages are for a topic that
+        #: was looked at before.
+        self._topics: dict[str, tuple[int, str]] = {}
 
     def begin(self, limits: FleetLimits) -> None:
         """A connection is up, with these limits."""
         self._limits = limits
+        self._topics.clear()
         self._backlog.connected()
 
     def send(self, connection: FleetConnection[Entry | None]) -> bool:
         """Hand messages to the connection; True if there may be more for another turn."""
         now = self._clock()
-        for _ in range(SENT_PER_TURN):
-            if not connection.room or (self._suspects and connection.inflight):
+        offset = time.time() - now
+        left = SENT_PER_TURN
+        while left > 0:
+            room, size = connection.room, WRITE_PORTION - connection.waiting
+            if not room or (self._suspects and connection.inflight):
                 return False
-            if connection.waiting >= WRITE_PORTION:
+            if size <= 0:
                 return True
-            entry = self._backlog.next(now)
-            if entry is None:
+            entries = self._backlog.take(now, 1 if self._suspects else min(left, room), size)
+            if not entries:
                 return False
-            self._publish(connection, entry, now)
+            left -= len(entries)
+            for place, entry in enumerate(entries):
+                try:
+                    self._publish(connection, entry, offset)
+                except BaseException:
+                    self._backlog.put_back(entries[place + 1 :])
+                    raise
         return True
 
     def due(self) -> float | None:
@@ -118,32 +122,51 @@ class Sender:
         due = self._backlog.due(now)
         return None if due is None else max(0.0, due - now)
 
-    def _publish(self, connection: FleetConnection[Entry | None], entry: Entry, now: float) -> None:
+    def _publish(
+        self, connection: FleetConnection[Entry | None], entry: Entry, offset: float
+    ) -> None:
+        """Hand one to the connection; the wall clock is ahead of the backlog's by `offset`."""
         record = entry.record
-        is_v5 = connection.settings.version == V5
-        properties = _properties(entry, now) if is_v5 else NO_PROPERTIES
-        size = HEADER_SIZE + len(record.topic.encode()) + len(properties) + len(record.payload)
-        why = self._limits.unsendable(record.topic, size)
-        if why:
+        topic, payload, limits = record.topic, record.payload, self._limits
+        properties = NO_PROPERTIES
+        if connection.settings.version == V5:
+            properties = record.properties_wire
+            at, number = entry.published_at, record.number if record.qos == 2 else None
+            if at is not None or number is not None or entry.expiry is not None:
+                at = None if at is None else at + offset
+                properties = self._properties.encode(properties, entry.expiry, number, at)
+        topic_size, why = self._topics.get(topic) or self._look_at(topic)
+        size = HEADER_SIZE + topic_size + len(properties) + len(payload)
+        if why or size > limits.packet_size:
+            why = limits.unsendable(topic, size)
             self._set_aside(entry, f"the fleet's broker does not take it: {why}")
             return
-        qos = min(entry.qos, self._limits.qos)
-        retain = record.retain and self._limits.retain
-        code = connection.publish(entry, record.topic, record.payload, qos, retain, properties)
+        qos = min(entry.qos, limits.qos)
+        retain = record.retain and limits.retain
+        code = connection.publish(entry, topic, payload, qos, retain, properties)
         if code:
             self._set_aside(entry, f"the fleet's broker does not take it: {reason_name(code)}")
         elif not qos:
             self._backlog.settle(entry)
 
+    def _look_at(self, topic: str) -> tuple[int, str]:
+        """The bytes of a topic, and why it cannot be used there."""
+        if len(self._topics) >= KNOWN_TOPICS:
+            self._topics.clear()
+        self._topics[topic] = found = len(topic.encode()), self._limits.unusable(topic)
+        return found
+
     def acknowledged(self, entries: Sequence[Entry | None], code: int, reason: str) -> None:
         """Messages were acknowledged, or refused with a code of 0x80 or above."""
-        for entry in entries:
-            if entry is None:
-                continue
-            self._clear(entry)
-            if code < 0x80:
-                self._backlog.settle(entry)
-            elif code in POISON:
+        ours = [entry for entry in entries if entry is not None]
+        if self._suspects:
+            for entry in ours:
+                self._clear(entry)
+        if code < 0x80:
+            self._backlog.settle_all(ours)
+            return
+        for entry in ours:
+            if code in POISON:
                 text = f"the fleet's broker refuses it: {reason_name(code)}"
                 self._set_aside(entry, f"{text}, {quote(reason)}" if reason else text)
             else:
@@ -151,8 +174,6 @@ class Sender:
 
     def _clear(self, entry: Entry) -> None:
         """The broker has answered: it does not close the connection on this message."""
-        if not self._suspects:
-            return
         self._suspects.pop(entry.record.number, None)
         self._patience -= 1
         if self._patience <= 0:
@@ -207,24 +228,3 @@ def _may_be_poison(ending: Ending) -> bool:
     if ending.by is EndedBy.US:
         return ending.is_violation  # it has answered nonsense
     return ending.by is EndedBy.NETWORK or ending.code in CLOSES_ON_MESSAGE
-
-
-def _properties(entry: Entry, now: float) -> bytes:
-    """The encoded properties of a message, with those that depend on when it is sent."""
-    record = entry.record
-    more: Properties = {}
-    pairs: list[tuple[str, str]] = []
-    if entry.expiry is not None:
-        more[Property.MESSAGE_EXPIRY_INTERVAL] = entry.expiry
-    if record.qos == 2:
-        pairs.append((_ID, f"{record.number:x}"))
-    if entry.published_at is not None:
-        at = datetime.fromtimestamp(time.time() - (now - entry.published_at), timezone.utc)
-        pairs.append((_PUBLISHED_AT, at.isoformat(timespec="milliseconds")))
-    if pairs:
-        more[Property.USER_PROPERTY] = pairs
-    wire = record.properties_wire
-    if not more:
-        return wire
-    inside = wire[decode_varint(wire, 0)[1] :] + encode_property_list(more)
-    return encode_varint(len(inside)) + inside

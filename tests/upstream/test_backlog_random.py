@@ -9,7 +9,7 @@ import pytest
 
 from appliance.upstream import backlog as module
 from appliance.upstream.backlog import DropReason
-from appliance.upstream.rule_queue import GONE, Entry
+from appliance.upstream.rule_queue import ENTRY_OVERHEAD, GONE, LATER, Entry
 from appliance.upstream.rules import OutRule
 from upstream.plain_backlogs import PlainBacklogs
 from upstream.test_backlog import Link, rule
@@ -424,3 +424,145 @@ def test_like_a_list(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_like_a_full_list(seed: int) -> None:
     _compare(Twin(seed, PLAIN, size=4_000), seed, OPERATIONS + ["offer"] * 10)
+
+
+# Several at once, against one by one.
+
+LANES = (rule("a"), rule("b", keep="all", priority="high"), rule("f", keep="all", priority="low"))
+
+
+def _state(entry: Entry) -> tuple[object, ...]:
+    told = (entry.qos, entry.expiry, entry.published_at, entry.attempts, entry.index, entry.size)
+    return entry.record, told
+
+
+class Pair:
+    """Two backlogs with the same life, but that the second is asked for one message at a time."""
+
+    def __init__(self, seed: int, rules: tuple[OutRule, ...], **limits: object) -> None:
+        self.choose = random.Random(seed)
+        self.rules = rules
+        size = self.choose.choice([200, 1000, 100_000])
+        self.links = [Link(*rules, backlogs=PlainBacklogs(size), **limits) for _ in range(2)]
+        self.flying: list[tuple[Entry, Entry]] = []
+        self.runs = 0
+
+    def offer(self) -> None:
+        choose = self.choose
+        of, qos = choose.randrange(len(self.rules)), choose.choice([0, 1, 1, 1, 2])
+        retain, expires = choose.random() < 0.05, choose.choice([None] * 8 + [0.3, 5.0])
+        payload, topic = b"x" * choose.choice([0, 10, 100]), f"{choose.randrange(4)}"
+        for _ in range(choose.choice([1, 1, 30])):
+            for link in self.links:
+                link.offer(payload, topic, qos, of=of, retain=retain, expires_in=expires)
+
+    def take(self) -> None:
+        fast, slow = self.links
+        most, size = self.choose.randint(1, 40), self.choose.choice([1, 300, 1 << 30])
+        while not (found := fast.backlog.take(fast.backlogs.time, most, size)):
+            if not fast.backlogs.rounds:
+                break
+            fast.backlogs.turn()
+        assert len(found) <= most
+        assert sum(entry.size for entry in found[:-1]) < size
+        self.runs += len(found) > 1
+        for entry in found:
+            other = slow.next()
+            assert other is not None
+            assert _state(entry) == _state(other)
+            self.flying.append((entry, other))
+        if not found:
+            assert slow.next() is None
+
+    def settle(self) -> None:
+        count = self.choose.choice([1, 3, 20, 100])
+        found, self.flying = self.flying[:count], self.flying[count:]
+        if self.choose.random() < 0.1:
+            self.choose.shuffle(found)
+        self.links[0].backlog.settle_all([one for one, _ in found])
+        for _, other in found:
+            self.links[1].backlog.settle(other)
+
+    def settle_again(self) -> None:
+        for link, entry in zip(self.links, self.flying[0] if self.flying else (), strict=False):
+            link.backlog.settle(entry)
+        if self.flying:
+            self.links[0].backlog.settle_all([self.flying.pop(0)[0]])
+
+    def put_back(self) -> None:
+        count = self.choose.randint(0, min(3, len(self.flying)))
+        found = self.flying[len(self.flying) - count :]
+        del self.flying[len(self.flying) - count :]
+        for number, link in enumerate(self.links):
+            link.backlog.put_back([each[number] for each in found])
+
+    def retry(self) -> None:
+        if self.flying:
+            place = self.choose.randrange(len(self.flying))
+            for link, entry in zip(self.links, self.flying.pop(place), strict=True):
+                link.backlog.retry_later(entry, link.backlogs.time)
+
+    def aside(self) -> None:
+        if self.flying:
+            for link, entry in zip(self.links, self.flying.pop(), strict=True):
+                link.backlog.set_aside(entry, "poison", link.backlogs.time)
+
+    def rewind(self) -> None:
+        self.flying.clear()
+        for link in self.links:
+            link.backlog.rewind()
+            link.backlog.connected()
+
+    def wait(self) -> None:
+        seconds = self.choose.choice([0.01, 0.1, 1.5])
+        for link in self.links:
+            link.backlogs.time += seconds
+            link.backlog.tick(link.backlogs.time)
+
+    def commit(self) -> None:
+        for link in self.links:
+            link.backlogs.commit()
+
+    def check(self) -> None:
+        fast, slow = (link.counts() for link in self.links)
+        assert fast == slow
+        assert fast.in_flight == len(self.flying)
+        stored = [
+            [
+                [segment.done for segment in journal.list]
+                for journal in link.backlogs.journals.values()
+            ]
+            for link in self.links
+        ]
+        assert stored[0] == stored[1]
+        for each in (link.backlog for link in self.links):
+            again = [entry for queue in each._queues.values() for entry in queue.again]
+            again += [entry for _, _, entry in each._later if entry.state == LATER]
+            waiting = [entry.size + ENTRY_OVERHEAD for entry in again if entry.state != GONE]
+            assert each._again_size == sum(waiting)
+        sizes = [
+            (each._flying_size, each._again_size, each._live_size, each._messages, each._bytes)
+            for each in (link.backlog for link in self.links)
+        ]
+        assert sizes[0] == sizes[1]
+
+
+def _live(pair: Pair) -> None:
+    names = ["offer"] * 4 + ["take"] * 8 + ["settle"] * 6 + ["wait", "commit"]
+    rare = ["settle_again", "put_back", "retry", "aside", "rewind"]
+    for _ in range(400):
+        name = pair.choose.choice(rare if pair.choose.random() < 0.05 else names)
+        getattr(pair, name)()
+        pair.check()
+    assert pair.runs > 1
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_several_at_once_are_those_that_come_one_by_one(seed: int) -> None:
+    _live(Pair(seed, MIXED if seed % 2 else LANES))
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("seed", range(10))
+def test_several_at_once_with_little_memory(seed: int) -> None:
+    _live(Pair(seed, LANES, size=20_000, age=3.0))
