@@ -8,7 +8,7 @@ import math
 import struct
 import time
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
 
 import pytest
 from waiting import until
@@ -36,8 +36,9 @@ from appliance.ros.node import BusError, Durability, Endpoint, FakePeer, QosProf
 from appliance.ros.payload.converter import Converter
 from appliance.ros.payload.fallback import ConversionError
 from appliance.ros.payload.payloads import ZSTD_MAGIC
-from appliance.ros.topics import commands, lease
+from appliance.ros.topics import commands, conversions, lease
 from appliance.ros.topics.commands import Commands
+from appliance.ros.topics.conversions import LITTLE
 from appliance.ros.topics.lease import REPEATED
 from appliance.ros.topics.rules import CommandRules, FieldLimits, OnSilence
 from appliance.ros.topics.staleness import (
@@ -1880,6 +1881,19 @@ async def test_a_payload_that_ros_cannot_have(harness, rules, qos, payload, code
     driver = Driver(harness.broker, "b")
     driver.drive(qos=qos)
     assert decode(driver.wire.written).reason_code == 0
+
+
+async def test_a_conversion_that_takes_all_of_its_turn(harness, monkeypatch):
+    """What the client has sent behind the large payload is done in its next turn."""
+    clock = count()
+    monkeypatch.setattr(conversions, "thread_time", lambda: 0.01 * next(clock))
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
+    driver.drive(b"{" + b" " * LITTLE, qos=2)
+    assert decode(driver.wire.written).reason_code == 0x99
+    driver.wire.written = b""
+    driver.say(Pubrel(7))
+    assert driver.wire.written[4] == 0x92
 
 
 def decode(data):
