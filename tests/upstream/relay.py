@@ -194,8 +194,11 @@ class _Pipe:
         self.fin = True
         if self.target.out.fin:  # that was the other one
             self._end(reset=False)
-        else:
+            return
+        try:
             self.target.transport.write_eof()
+        except OSError:  # its peer has reset it, which the loop has not read yet
+            self._end(reset=True)
 
     def _end(self, *, reset: bool) -> None:
         self.source.into.ended = self.ended = True

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 import pytest
 from waiting import PATIENCE, until
 
-from upstream.relay import RESET, Relay, RelayProcess
+from upstream.relay import CAPACITY, RESET, Relay, RelayProcess
 
 
 class Server:
@@ -299,3 +299,21 @@ async def test_in_a_process_of_its_own(server, apart) -> None:
     with pytest.raises(ConnectionResetError):
         await asyncio.wait_for(reader.read(), PATIENCE)
     writer.close()
+
+
+async def test_a_reset_that_is_behind_a_fin_is_passed_on(relay, server, dial) -> None:
+    """Both ends give up during a silence, and the one that the relay does not read with a RST."""
+    client = await dial()
+    relay.silence()
+    server.writers[0].write(bytes(2 * CAPACITY))
+    await until(lambda: relay.held >= CAPACITY)  # it reads no more of it
+    client.writer.write_eof()
+    near = next(iter(relay._connections)).up
+    await until(lambda: len(near._queue) == 1)
+    sock = server.writers[0].get_extra_info("socket")
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+    server.writers[0].transport.abort()
+    await asyncio.sleep(0)  # closed, and the relay has not read anything since
+    relay.release()
+    await until(lambda: relay.connections == 0)
+    assert client.end == "RST"
