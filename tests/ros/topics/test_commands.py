@@ -2169,15 +2169,15 @@ async def test_a_stop_overtakes_a_retained_command_that_is_awaited(harness, stop
 
 
 @pytest.mark.parametrize("size", [0, 2000])
-@pytest.mark.parametrize("off", ["0.3 s ahead", "an hour ahead", "milliseconds", "no zone"])
+@pytest.mark.parametrize("off", ["a minute ahead", "an hour ahead", "milliseconds", "no zone"])
 @pytest.mark.parametrize("qos", [0, 1, 2])
 async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(harness, qos, off, size):
-    harness.start(CommandRules(expire=0.5, on_silence=OnSilence(5.0)))
+    harness.start(CommandRules(expire=60, on_silence=OnSilence(60.0)))
     driver, other = Driver(harness.broker, "a"), Driver(harness.broker, "b")
     other.steer()
     now = time.time()
     text = {
-        "0.3 s ahead": str(now + 0.3),
+        "a minute ahead": str(now + 60),
         "an hour ahead": str(now + 3600),
         "milliseconds": str(int(now * 1000)),
         "no zone": "2026-05-28T20:26:40",
