@@ -156,6 +156,9 @@ class Broker:
         self.guards = self.router.guards
         #: Called with each session whose connection has ended, before its will is published.
         self.departures: list[Callable[[Session], None]] = []
+        #: Asked why a message to a topic would be lost now, although it is published here: the
+        #: bridge to ROS may not be ready. Each returns an empty string when it would not.
+        self.obstacles: list[Callable[[str], str]] = []
         self.audit_log: AuditLog | None = None
         #: Network clients with a connection in the state CONNECTED.
         self.clients: set[Ticking] = set()
@@ -567,6 +570,14 @@ class Broker:
         self.features = features
         self.accounting.use(limits)
         self.router.changed()  # topics may be too long now, or not any more
+
+    def obstacle(self, topic: str) -> str:
+        """Why a message to this topic would be lost now; empty when not. See `obstacles`."""
+        for ask in self.obstacles:
+            why = ask(topic)
+            if why:
+                return why
+        return ""
 
     def guards_changed(self) -> None:
         """Guards were added or removed, or their decisions changed."""

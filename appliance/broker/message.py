@@ -122,6 +122,11 @@ class Message:
         """Seconds between its arrival and its publication, see `DelayedMessage`."""
         return 0.0
 
+    @property
+    def is_dated(self) -> bool:
+        """Whether its own age is all that there is to know, see `DatedMessage`."""
+        return False
+
     def dropped(self) -> None:
         """Note that a session dropped it because the client was too slow, see `CountedMessage`."""
 
@@ -244,3 +249,16 @@ class DelayedMessage(Message):
     @property
     def age(self) -> float:
         return self._age
+
+
+class DatedMessage(DelayedMessage):
+    """A message that came over a link, whose `age` is the most that it can be.
+
+    It says nothing of what comes behind it: a link carries the messages of many clients.
+    """
+
+    __slots__ = ()
+
+    @property
+    def is_dated(self) -> bool:
+        return True

@@ -455,6 +455,10 @@ class PublishRejection:
 class PublishGuard(Protocol):
     """A part of the appliance that restricts who may publish to its topic, beside the rules."""
 
+    @property
+    def takes_retained(self) -> bool:
+        """Whether a retained message is a command for it."""
+
     def decide(self, session: Session) -> Decision:
         """Whether the session may publish; the decision holds until `Broker.guards_changed`."""
 

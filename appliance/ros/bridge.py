@@ -72,6 +72,9 @@ LONGEST_RETRY = 60.0
 METER_INTERVAL = 1.0
 METERS_TO_ANNOUNCE = 10
 
+#: Seconds from joining the bus on for which a topic of a pattern that is not there is expected.
+DISCOVERY = 10.0
+
 #: Seconds until the mailbox is emptied again after that has failed.
 DRAIN_AGAIN = 0.05
 
@@ -260,6 +263,7 @@ class Bridge:
         self._session = self._broker.attach(BRIDGE_CLIENT_ID, ReceivingLink(self._receive))
         self._subscribe()
         self._broker.departures.append(self._context.staleness.on_departed)
+        self._broker.obstacles.append(self._obstacle)
         self.calls.start()
         self._clear_schemas(self._session)
         self.clean_up_retained()
@@ -304,6 +308,7 @@ class Bridge:
             flow.leave()
         if self._context.staleness.on_departed in self._broker.departures:
             self._broker.departures.remove(self._context.staleness.on_departed)
+            self._broker.obstacles.remove(self._obstacle)
         await self.calls.leave()
         await asyncio.to_thread(self._node.stop)
         session = self._session
@@ -344,6 +349,19 @@ class Bridge:
     def node_name(self) -> str:
         """The full name of the bridge's node."""
         return self._node.name
+
+    def _obstacle(self, topic: str) -> str:
+        """See `Broker.obstacles`: why ROS would not get a message to this topic now."""
+        flows = self._receivers.get(topic)
+        if flows:
+            return next(filter(None, (flow.obstacle() for flow in flows)), "")
+        since = self._joined_at
+        if since is not None and self._loop.time() - since > DISCOVERY:
+            return ""
+        patterns = (route for route in self._routes if route.direction == "to_ros")
+        if not any(route.is_pattern and route.takes(topic) for route in patterns):
+            return ""
+        return "ROS is not ready" if since is None else "no such topic is known on ROS yet"
 
     def _receive(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
         size = size_of(message.payload)

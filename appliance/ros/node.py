@@ -91,6 +91,10 @@ class RosPublisher(Protocol):
     def publish(self, cdr: bytes) -> None:
         """Publish a serialized message; from any thread. Raises BusError."""
 
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether a subscription is connected to it; from any thread."""
+
     def destroy(self) -> None:
         """End it; `publish` raises BusError from now on. On the ROS thread."""
 
@@ -322,6 +326,11 @@ class FakePublisher:
         if self.error or self.destroyed:
             raise BusError(self.error or "the publisher has been destroyed")
         self.bus.deliver(self.topic, self.endpoint, cdr)
+
+    @property
+    def has_subscribers(self) -> bool:
+        peers = self.bus.remote_subscribers
+        return any(peer.topic == self.topic for peer in peers)
 
     def destroy(self) -> None:
         self.destroyed = True

@@ -7,7 +7,8 @@ the greatest age that it can have, by which routes to ROS judge it again.
 
 Messages are acknowledged on their connection only, in the order in which they came, after the
 commit that they depend on. A message whose receivers have no room waits, and with it all that comes
-behind it, as with a client here; acknowledgements of what the link sends do not wait. When too much
+behind it, as with a client here; acknowledgements of what the link sends do not wait. So does one
+that the fleet's broker has kept while ROS is not ready for it (`readiness.py`). When too much
 waits, the connection is not read; what comes all the same is refused (0x97).
 """
 
@@ -22,7 +23,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.client import PACKET_COST, RECHECK, RIGHTS_PATIENCE
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.handshake import is_text
-from appliance.broker.message import OVERHEAD, DelayedMessage, Message
+from appliance.broker.message import OVERHEAD, DatedMessage, Message
 from appliance.broker.output import CANNOT_KEEP
 from appliance.broker.ports import Identity, InsideLink, PeerStatus
 from appliance.broker.routing import Fanout
@@ -43,6 +44,7 @@ from appliance.upstream.answers import Answers, reply_topic
 from appliance.upstream.late import Verdict, greatest_age, judge
 from appliance.upstream.link_events import Arrived
 from appliance.upstream.loops import circle
+from appliance.upstream.readiness import Readiness
 from appliance.upstream.rules import InRule, LinkRules, UpstreamSettings
 from appliance.upstream.sessions import in_client_id, kept_client_id
 
@@ -50,6 +52,9 @@ from appliance.upstream.sessions import in_client_id, kept_client_id
 #: much, what was read of a chunk all the same is refused.
 WAITING_MESSAGES: Final = 1000
 WAITING_BYTES: Final = 4 << 20
+
+#: Seconds between two looks whether ROS is ready for a kept message that waits for it.
+LOOK_INTERVAL: Final = 0.25
 
 #: The cost of decoding the properties of a request to change its Response Topic.
 REQUEST_COST: Final = 5
@@ -166,6 +171,7 @@ class InSession:
         #: Since when the first one waits for decisions; None when it does not.
         self._undecided_since: float | None = None
         self._allowance = PublisherAllowance()
+        self._readiness = Readiness()
 
     def __str__(self) -> str:
         return str(self._session)
@@ -300,6 +306,8 @@ class InSession:
             return True
         if self._is_dropped(came, rule, topic):
             return True
+        if self._is_kept and self._waits_for_ros(topic):
+            return False
         message = self._message(came, topic)
         return self._deliver(came, message, self._session)
 
@@ -315,7 +323,7 @@ class InSession:
             dup=packet.dup,
             retain=packet.retain,
         )
-        if packet.retain and rule.retained == "drop":
+        if packet.retain and (rule.retained == "drop" or self._is_command(packet, topic)):
             verdict = Verdict.RETAINED
         if verdict is Verdict.TAKE:
             return False
@@ -329,6 +337,14 @@ class InSession:
         )
         self._acknowledge(packet, ReasonCode.SUCCESS)
         return True
+
+    def _is_command(self, packet: Arrived, topic: str) -> bool:
+        """Whether a retained message is a command of unknown age: a local subscriber would get it
+        as a new one. A route may ask for it, and what deletes a retained message is no command."""
+        guards = self._broker.guards.get(topic)
+        if not guards or not packet.payload:
+            return False
+        return not any(guard.takes_retained for guard in guards)
 
     def _message(self, came: _Came, topic: str) -> Message:
         """The message here: with its greatest age, and a Response Topic of ours if it has one."""
@@ -358,7 +374,7 @@ class InSession:
         age = greatest_age(
             now=now, left_after=packet.not_before, dup=packet.dup, retain=packet.retain
         )
-        return DelayedMessage(message, age)
+        return DatedMessage(message, age)
 
     def _publish_answer(self, came: _Came, topic: str) -> bool:
         """Publish an answer where a requester here waits for it, who may publish there itself."""
@@ -425,6 +441,17 @@ class InSession:
             return False
         self._connection.later(max(left, RECHECK))
         return True
+
+    def _waits_for_ros(self, topic: str) -> bool:
+        """Whether ROS does not take messages to this topic yet, but soon may."""
+        broker = self._broker
+        why = broker.obstacle(topic)
+        waits, news = self._readiness.judge(topic, why, broker.now)
+        if news:
+            broker.log_rate_limited(self._session, "%s: %s (%s)", quote(topic), news, why)
+        if waits:
+            self._connection.later(LOOK_INTERVAL)
+        return waits
 
     def _waits_for_receivers(self, route: Fanout, message: Message) -> bool:
         """Whether receivers have no room now, but soon will: see `broker.backpressure`."""

@@ -49,7 +49,8 @@ def judge(
 
     It left the fleet's broker after `left_after`, see `Freshness.left_after`, and had `expiry` to
     live when it arrived (None: for ever). `late` is the rule's limit, None for none. A retained
-    message is a state and no command: it is taken, and known to be of unknown age.
+    message is a state and no command: it is taken, and known to be of unknown age. Where a route to
+    ROS takes its topic, `InSession` drops it.
     """
     if expiry is not None and now >= arrived_at + expiry:
         return Verdict.EXPIRED

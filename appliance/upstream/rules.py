@@ -11,7 +11,7 @@ Topics that the link uses itself are carried by no rule: see `LinkRules.is_own_l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Generic, Literal, TypeAlias, TypeVar
@@ -129,11 +129,21 @@ class InRule(MappedTopics):
     A message that may be older than `late` seconds is dropped; None: none is. With `offline` keep
     the fleet's broker queues messages while the link is down, so that they are late on purpose.
     What is `retained` there is of unknown age: no command, or, with `drop`, nothing at all.
+
+    `judged_by` is the least age, in seconds, for which a route that the rule feeds refuses a
+    message, None without such a route: ages have to be known more exactly than that.
     """
 
     late: float | None = LATE
     offline: Literal["drop", "keep"] = "drop"
     retained: Literal["take", "drop"] = "take"
+    judged_by: float | None = None
+
+    @property
+    def least_age(self) -> float | None:
+        """The least age for which a message is refused, here or by a route; None: none is."""
+        ages = [age for age in (self.late, self.judged_by) if age is not None]
+        return min(ages, default=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +155,51 @@ class CommandTopics:
     expire: float | None = None
     silence: float | None = None
 
+    @property
+    def oldest(self) -> float | None:
+        """The age from which on the route rejects a command; see `CommandRules.oldest`."""
+        return self.silence if self.expire is None else self.expire
 
-def default_late(local_filter: str, routes: Iterable[CommandTopics]) -> float:
-    """The `late` of a rule that does not say it: the least time of the routes that it feeds."""
-    fed = [route for route in routes if overlaps(route.filter, local_filter)]
-    times = [time for route in fed for time in (route.expire, route.silence) if time is not None]
-    return min(times, default=LATE)
+
+@dataclass(frozen=True, slots=True)
+class CallTopics:
+    """The topics of calls to ROS, and the age in seconds from which on a call has expired."""
+
+    filter: str
+    timeout: float
+
+
+@dataclass(frozen=True, slots=True)
+class RosTopics:
+    """What routes to ROS take."""
+
+    commands: tuple[CommandTopics, ...] = ()
+    calls: tuple[CallTopics, ...] = ()
+
+    def default_late(self, local_filter: str) -> float:
+        """The `late` of a rule that does not say it.
+
+        The least time of the routes for commands that it feeds. A call that is older than its
+        timeout is answered, with an error: it is dropped only when it is later than all of them.
+        """
+        timeouts = [each.timeout for each in self._calls(local_filter)]
+        return min(self._times(local_filter), default=max([LATE, *timeouts]))
+
+    def judged_by(self, local_filter: str) -> float | None:
+        """See `InRule.judged_by`."""
+        oldest = [route.oldest for route in self._commands(local_filter)]
+        timeouts = [each.timeout for each in self._calls(local_filter)]
+        return min([*filter(None, oldest), *timeouts], default=None)
+
+    def _times(self, local_filter: str) -> list[float]:
+        fed = self._commands(local_filter)
+        return [time for route in fed for time in (route.expire, route.silence) if time is not None]
+
+    def _commands(self, local_filter: str) -> list[CommandTopics]:
+        return [each for each in self.commands if overlaps(each.filter, local_filter)]
+
+    def _calls(self, local_filter: str) -> list[CallTopics]:
+        return [each for each in self.calls if overlaps(each.filter, local_filter)]
 
 
 @dataclass(frozen=True, slots=True)

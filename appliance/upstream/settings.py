@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from appliance.config import Settings, TopicRoute, UpstreamSection
 from appliance.config.settings import InSection, ProfileSection
 from appliance.mqtt.codec import V5, V311
 from appliance.upstream.rules import (
     BacklogLimits,
+    CallTopics,
     CommandTopics,
     InRule,
     OutRule,
+    RosTopics,
     UpstreamLogin,
     UpstreamSettings,
     UpstreamTls,
     Vehicle,
-    default_late,
 )
 
 
 def upstreams(settings: Settings) -> list[UpstreamSettings]:
     """The links, in the order of the file."""
-    commands = list(command_topics(settings))
-    return [_upstream(section, settings.robot, commands) for section in settings.upstreams]
+    ros = RosTopics(tuple(command_topics(settings)), tuple(call_topics(settings)))
+    return [_upstream(section, settings.robot, ros) for section in settings.upstreams]
 
 
 def command_topics(settings: Settings) -> Iterator[CommandTopics]:
@@ -39,10 +40,41 @@ def command_topics(settings: Settings) -> Iterator[CommandTopics]:
             yield CommandTopics(filter, route.expire, silence)
 
 
+def call_topics(settings: Settings) -> Iterator[CallTopics]:
+    """The topics of calls to ROS, with their timeouts. Cancellations never expire."""
+    bridge = settings.bridge
+    if bridge.bus == "none":
+        return
+    robot = settings.robot
+    for service in bridge.services:
+        if service.to == "ros":
+            for name in _included(service.names):
+                yield CallTopics(_below(service.mqtt, robot, name, "_call"), service.timeout)
+    for action in bridge.actions:
+        for name in _included(action.names):
+            yield CallTopics(_below(action.mqtt, robot, name, "_goal"), action.timeout)
+    for route in bridge.parameters:
+        for name in _included(route.names):
+            node = name.rpartition("/")[0]
+            yield CallTopics(_below(route.mqtt, robot, node, "#"), route.timeout)
+
+
+def _included(names: Sequence[str]) -> list[str]:
+    return [name for name in names if not name.startswith("!")]
+
+
+def _below(template: str, robot: str, name: str, call: str) -> str:
+    """The filter for a call below a ROS name, and for the token that MQTT 3.1.1 clients append."""
+    topic = template.replace("{robot}", robot)
+    for part in ("{ros}", "{node}"):
+        topic = topic.replace(part, _ros_filter(name))
+    return _filter(f"{topic}/{call}/#")
+
+
 def command_filters(route: TopicRoute, robot: str) -> list[str]:
     """Filters of the topics that the route takes; what it leaves out is among them."""
     topic = route.topic(robot)
-    names = [name for name in route.names if not name.startswith("!")]
+    names = _included(route.names)
     return [_filter(topic.replace("{ros}", _ros_filter(name))) for name in names]
 
 
@@ -61,9 +93,7 @@ def _filter(topic: str) -> str:
     return "/".join(levels)
 
 
-def _upstream(
-    section: UpstreamSection, robot: str, commands: list[CommandTopics]
-) -> UpstreamSettings:
+def _upstream(section: UpstreamSection, robot: str, ros: RosTopics) -> UpstreamSettings:
     def named(text: str) -> str:
         return text.replace("{robot}", robot)
 
@@ -93,7 +123,8 @@ def _upstream(
                 InRule,
                 local_prefix=named(rule.local_prefix),
                 remote_prefix=rule.prefix_there(robot, section.prefix),
-                late=_late(rule, robot, commands),
+                late=_late(rule, robot, ros),
+                judged_by=ros.judged_by(rule.local_filter(robot)),
             )
             for rule in section.inward
         ),
@@ -110,9 +141,9 @@ def _vehicle(profile: ProfileSection, robot: str) -> Vehicle:
     )
 
 
-def _late(rule: InSection, robot: str, commands: list[CommandTopics]) -> float | None:
+def _late(rule: InSection, robot: str, ros: RosTopics) -> float | None:
     if rule.late is not None:
         return rule.late
     if rule.offline == "keep":  # what has been queued while the link was down is late on purpose
         return None
-    return default_late(rule.local_filter(robot), commands)
+    return ros.default_late(rule.local_filter(robot))

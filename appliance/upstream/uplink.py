@@ -358,15 +358,11 @@ class Uplink:
         ]
 
     def least_late(self, *, is_kept: bool) -> float | None:
-        """The least `late` of the rules on a connection."""
-        if is_kept:
+        """The least age for which what comes on a connection is refused as late."""
+        if is_kept:  # by a session that is kept, all of it may be
             return None
-        times = [
-            rule.late
-            for rule in self.settings.inward
-            if rule.offline == "drop" and rule.late is not None
-        ]
-        return min(times, default=None)
+        rules = [rule for rule in self.settings.inward if rule.offline == "drop"]
+        return min((age for rule in rules if (age := rule.least_age) is not None), default=None)
 
     def surroundings(self) -> Surroundings:
         """For the transport."""

@@ -6,22 +6,30 @@ The bridge, its routes and the broker are the real ones, on a FakeNode.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 from waiting import until
 
 from appliance.mqtt.reason import ReasonCode
+from appliance.ros import bridge
+from appliance.ros.bridge import TopicSettings
 from appliance.ros.topics.rules import CommandRules, OnSilence
+from appliance.upstream.in_session import LOOK_INTERVAL
 from appliance.upstream.late import LEAST_WINDOW, Verdict
+from appliance.upstream.readiness import GIVES_UP, PATIENCE
 
 pytest.importorskip("geometry_msgs.msg")
+from bridge_harness import TWIST, Harness
 from command_harness import AFTER, GO, STOP, CommandHarness, twist
 
 from .local_rig import Fleet, Rig
 
-KEYS = 'user: upstream, out: [], in: [{topic: cmd_vel, late: 500 ms}, {topic: "reset/#"}]'
+KEYS = """\
+user: upstream, out: [], in: [{topic: cmd_vel, late: 500 ms}, {topic: "reset/#"},
+{topic: "mission/#", offline: keep}]"""
 TOPIC = "fleet/r2d2/cmd_vel"
 
 
@@ -123,16 +131,88 @@ async def test_a_command_is_judged_again_by_its_route(robot: Robot) -> None:
     assert robot.robot.received == [] and robot.counters().expired == 1
 
 
-async def test_a_retained_command_of_the_fleet_does_not_reach_ros(robot: Robot) -> None:
-    for rules in (CommandRules(), CommandRules(expire=0.5)):
+async def test_a_retained_command_of_the_fleet_is_dropped(robot: Robot) -> None:
+    """It does not reach ROS, and no local subscriber takes it for a new one."""
+    peer = robot.rig.join("other", user="upstream")
+    peer.subscribe("r2d2/cmd_vel")
+    for rules in (None, CommandRules(), CommandRules(expire=0.5)):
         robot.start(rules)
         fleet = robot.join()
         assert fleet.send(TOPIC, GO, 1, retain=True) == 0
         await robot.settle()
-        assert robot.robot.received == []
-        assert robot.broker.retained.get("r2d2/cmd_vel") is not None
+        assert robot.robot.received == [] and peer.received() == []
+        assert robot.broker.retained.get("r2d2/cmd_vel") is None
         fleet.session.detach()
         await robot.bridge.stop()
+    assert robot.rig.counters.dropped["fleet/r2d2/cmd_vel", Verdict.RETAINED] == 3
+
+
+async def test_a_route_that_asks_for_retained_commands_gets_them(robot: Robot) -> None:
+    robot.start(CommandRules(take_retained=True))
+    for _ in range(3):  # until the two ends have found each other
+        robot.node.spin()
+    fleet = robot.join()
+    assert fleet.send(TOPIC, GO, 1, retain=True) == 0
+    await until(lambda: twist(0.5) in robot.robot.received, "the command")
+    kept = robot.broker.retained.get("r2d2/cmd_vel")
+    assert kept is not None and kept.payload == GO
+    fleet.send(TOPIC, b"", 1, retain=True)
+    assert robot.broker.retained.get("r2d2/cmd_vel") is None
+
+
+MISSION = "fleet/r2d2/mission/go"
+
+
+@pytest.mark.parametrize("ros", ["/mission/go", "/mission/*"])
+async def test_a_kept_mission_waits_for_ros(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, ros: str
+) -> None:
+    """It came while the robot's nodes were starting: nothing that is acknowledged is lost."""
+    route = TopicSettings(ros, "ros", "r2d2{ros}", TWIST if ros == "/mission/go" else None)
+    start = robot.node.start
+    begin: list[Callable[[], None]] = []
+    monkeypatch.setattr(robot.node, "start", lambda *how: begin.append(partial(start, *how)))
+    Harness.start(robot, route)
+    robot.rig.now = robot.loop.time()
+    fleet = robot.rig.connect(is_kept=True)
+    missions = [fleet.put(topic, GO) for topic in (MISSION, MISSION, "fleet/r2d2/mission/other")]
+    fleet.turn(LOOK_INTERVAL)
+    assert fleet.connection.codes() == [] and fleet.connection.turn_in == LOOK_INTERVAL
+    assert fleet.session.waiting == 3
+    begin[0]()
+    node = robot.node.add_subscriber("/mission/go", TWIST)
+    await until(lambda: not robot.broker.obstacle("r2d2/mission/go"), "the subscription")
+    assert node.received == []
+    fleet.turn(LOOK_INTERVAL)
+    if ros == "/mission/*":  # what else is there may yet be found
+        assert fleet.session.waiting == 1
+        monkeypatch.setattr(bridge, "DISCOVERY", 0.0)
+        fleet.turn(LOOK_INTERVAL)
+    assert node.received == [twist(0.5)] * 2
+    assert fleet.connection.codes() == [(each, 0) for each in missions]
+
+
+async def test_a_mission_for_a_node_that_is_not_there_waits_in_vain_once(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
+    Harness.start(robot, TopicSettings("/mission/go", "ros", "r2d2{ros}", TWIST))
+    robot.rig.now = robot.loop.time()
+    fleet = robot.rig.connect(is_kept=True)
+    first = fleet.put(MISSION, GO)
+    fleet.turn(PATIENCE - 1)
+    assert fleet.connection.codes() == []
+    fleet.turn(1)
+    assert fleet.connection.codes() == [(first, 0)]
+    assert fleet.send(MISSION, GO) == 0  # at once
+    assert "waits for ROS (no node has subscribed to /mission/go)" in caplog.text
+    assert GIVES_UP in caplog.text
+    # With a node, and without it again: that it comes back is likely.
+    node = robot.node.add_subscriber("/mission/go", TWIST)
+    assert fleet.send(MISSION, GO) == 0 and node.received == [twist(0.5)]
+    node.remove()
+    fleet.put(MISSION, GO)
+    fleet.turn(LOOK_INTERVAL)
+    assert fleet.connection.codes() == [] and fleet.session.waiting == 1
 
 
 async def test_the_fleet_holds_the_lease_and_loses_it_with_the_link(robot: Robot) -> None:

@@ -29,7 +29,7 @@ from appliance.upstream.rules import (
     InRule,
     LinkRules,
     OutRule,
-    default_late,
+    RosTopics,
 )
 from appliance.upstream.settings import command_filters
 from upstream.links import link
@@ -292,10 +292,43 @@ def test_the_topics_that_a_route_takes(route: dict[str, object], filters: list[s
 
 
 def test_late_of_overlapping_filters() -> None:
-    routes = [CommandTopics("r2/a", 3.0, 2.0), CommandTopics("r2/+", None, 5.0)]
-    assert default_late("r2/#", routes) == 2.0
-    assert default_late("r2/b", routes) == 5.0
-    assert default_late("r2/a/b", routes) == LATE
+    ros = RosTopics((CommandTopics("r2/a", 3.0, 2.0), CommandTopics("r2/+", None, 5.0)))
+    assert (ros.default_late("r2/#"), ros.judged_by("r2/#")) == (2.0, 3.0)
+    assert (ros.default_late("r2/b"), ros.judged_by("r2/b")) == (5.0, 5.0)
+    assert (ros.default_late("r2/a/b"), ros.judged_by("r2/a/b")) == (LATE, None)
+
+
+CALLS = """\
+bridge:
+  services: [{ros: /reset, timeout: 2 s}, {ros: "/arm/*", timeout: 1 min}]
+  actions: [{ros: /walk}]
+  parameters: [{ros: "/controller/*", timeout: 3 s}]
+  topics: [{ros: /cmd_vel, to: ros, expire: 400 ms}]"""
+
+
+@pytest.mark.parametrize(
+    ("rule", "late", "least"),
+    [
+        # A late call is answered that it is late, so that it is taken; but its age has to be known.
+        ("{topic: reset/_call}", LATE, 2.0),
+        ("{topic: +/_goal}", LATE, 5.0),
+        ("{topic: +/_cancel}", LATE, LATE),
+        ("{topic: arm/grip/_call}", 60.0, 60.0),
+        ("{topic: controller/_param/+/set}", LATE, 3.0),
+        ("{topic: reset/_call, late: 8 s}", 8.0, 2.0),
+        ("{topic: reset/_call, late: 1 s}", 1.0, 1.0),
+        ('{topic: "#"}', 0.4, 0.4),
+        ("{topic: cmd_vel, late: 5 s}", 5.0, 0.4),
+        ("{topic: reset/_call, offline: keep}", None, 2.0),
+        ("{topic: other}", LATE, LATE),
+    ],
+)
+def test_late_of_calls(rule: str, late: float | None, least: float) -> None:
+    settings = link(f"in: [{rule}]", CALLS)
+    (found,) = settings.inward
+    assert (found.late, found.least_age) == (late, least)
+    (found,) = link(f"in: [{rule}]", "bridge: {bus: none}").inward
+    assert found.judged_by is None
 
 
 def test_a_link_is_what_the_file_says() -> None:

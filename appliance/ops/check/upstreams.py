@@ -278,7 +278,7 @@ def _commands(settings: Settings, link: UpstreamSettings) -> Iterator[Finding]:
             if not said and not any(route.expire or route.on_silence for route in fed):
                 text += ", as no route has expire or on_silence"
             yield Finding("ok", subject, text)
-        elif said:
+        elif said and not _carries_calls(settings, rule):
             text = f"in {rule.topic}: late is for commands, and no route to ROS takes its topics"
             yield Finding("warning", subject, text)
 

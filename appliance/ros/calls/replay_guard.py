@@ -34,7 +34,8 @@ class ReplayGuard:
 
     A message that is sent again after a lost connection has an age. The messages that its client
     queued in the meantime follow it and look new. So after an old message, all of its client's
-    count as old for the time that makes a message old, and longer while they come in bursts.
+    count as old for the time that makes a message old, and longer while they come in bursts. What
+    comes over a link is judged by its own age: behind it are many clients.
     """
 
     def __init__(self) -> None:
@@ -45,7 +46,7 @@ class ReplayGuard:
     ) -> bool:
         """Whether the message is older than `max_age`, in seconds, or part of a replay."""
         is_old = message.age > max_age
-        if publisher is None:
+        if publisher is None or message.is_dated:
             return is_old
         replay = self._replays.get(publisher)
         if replay is None:

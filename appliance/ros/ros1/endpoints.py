@@ -191,6 +191,11 @@ class Ros1Publisher:
         except self._refusals as error:
             raise BusError(str(error)) from error
 
+    @property
+    def has_subscribers(self) -> bool:
+        impl = self._own.impl  # rospy's, which is None once the publisher is unregistered
+        return impl is not None and impl.has_connections()
+
     def reaches(self, nodes: Iterable[str]) -> bool:
         """Whether one of these nodes is connected."""
         return any(map(self._own.impl.has_connection, nodes))

@@ -490,6 +490,13 @@ class _Ros2Publisher:
         except self._refusals as error:  # the transport is full, or the node has ended
             raise BusError(str(error)) from error
 
+    @property
+    def has_subscribers(self) -> bool:
+        try:
+            return bool(self._own.get_subscription_count())
+        except self._refusals:  # it is being destroyed
+            return False
+
     def destroy(self) -> None:
         self._node.destroy_publisher(self._own)
 

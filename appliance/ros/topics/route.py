@@ -78,6 +78,14 @@ class BridgeRoute:
         """Whether the route is for this topic, which carries these types."""
         return ros in self._names and any(map(self.fits, types))
 
+    def takes(self, mqtt: str) -> bool:
+        """Whether the route may be for this MQTT topic, by its ROS name."""
+        before, has_name, after = self.settings.mqtt.partition("{ros}")
+        if not has_name:
+            return mqtt == before
+        is_around = mqtt.startswith(before) and mqtt.endswith(after)
+        return is_around and mqtt[len(before) : len(mqtt) - len(after)] in self._names
+
     def refusal(self, ros: str, types: Iterable[str]) -> tuple[SkipReason, str] | None:
         """Why the route does not take a topic that matches its pattern; None when it takes it, or
         when no pattern matches."""

@@ -190,6 +190,13 @@ class ToRos(Flow):
             message.rejection = rejection
         return rejection
 
+    def obstacle(self) -> str:
+        """Why nobody on ROS would receive a message now; empty when somebody would."""
+        outlet = self.follower.publication.outlet
+        if outlet is None:
+            return f"{self.ros}: {self._why_not()}"
+        return "" if outlet.publisher.has_subscribers else f"no node has subscribed to {self.ros}"
+
     def fault(self, message: Message, error: Exception) -> PublishRejection:
         """Reject a message because of a fault of the appliance, which is reported."""
         self._context.broker.faults.caught("bridge.receive", error, self)

@@ -6,6 +6,7 @@ import asyncio
 import gc
 import json
 import logging
+import math
 import time
 
 import pytest
@@ -14,7 +15,7 @@ from waiting import until
 pytest.importorskip("std_srvs.srv")
 from call_harness import AllTypes, CallHarness, call_routes, service
 
-from appliance.broker.message import DelayedMessage, Message
+from appliance.broker.message import DatedMessage, DelayedMessage, Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
@@ -324,6 +325,23 @@ async def test_an_old_call_is_not_carried_out_nor_what_was_queued_behind_it(harn
     late = DelayedMessage(again, 1.0)  # within its time
     harness.broker.publish(late, harness.client("bob").session)
     await until(lambda: switch.asked, "another client's call")
+
+
+async def test_a_late_call_of_a_link_says_nothing_of_those_behind_it(harness):
+    """They are of other clients of the fleet, and come in bursts, too."""
+    harness.start(service("/switch"))
+    switch = Switch(harness)
+    harness.node.spin()
+    await asyncio.sleep(0)
+    link = harness.client("link")
+    said = {Property.RESPONSE_TOPIC: "answers/link"}
+    for payload, age in ((b"", 60.0), (b"", math.inf), *[(b'{"data": true}', 4.0)] * 5):
+        call = DatedMessage(Message(CALL, payload, 1, properties=said), age)
+        harness.broker.publish(call, link.session)
+    await until(lambda: len(link.on("answers/link")) == 7, "the answers")
+    answers = link.payloads("answers/link")
+    assert [each["error"]["code"] for each in answers if "error" in each] == ["expired"] * 2
+    assert switch.asked == [True] * 5
 
 
 @pytest.mark.parametrize(
