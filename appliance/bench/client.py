@@ -12,7 +12,8 @@ import resource
 import select
 import socket
 import ssl
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -23,6 +24,16 @@ RECORDS = memoryview(bytearray(RECORDS_BYTES))  # shared: allocating one a call 
 
 class LoadError(Exception):
     """The broker could not be driven; the text says why."""
+
+
+@contextlib.contextmanager
+def reporting(name: str) -> Iterator[None]:
+    """For a program: what fails is told on standard error, and the exit status is 1."""
+    try:
+        yield
+    except (LoadError, OSError) as error:
+        sys.stderr.write(f"{name}: {error}\n")
+        sys.exit(1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 
-from appliance.bench.client import LoadError, LoadTarget, allow_files, connect_packet
+from appliance.bench.client import LoadError, LoadTarget, allow_files, connect_packet, reporting
 from appliance.bench.load import percentile, pin
 from appliance.bench.probe import print_answer
 
@@ -181,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     gc.disable()
     allow_files(options.clients + OTHER_FILES)
-    try:
+    with reporting("crowd"):
         target = LoadTarget.of(options)
         crowd = Crowd(target)
         pin(target.pids)
@@ -193,9 +193,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if sys.stdin.readline():
                 print_answer(crowd.leave())
                 sys.stdin.readline()
-    except (LoadError, OSError) as error:
-        sys.stderr.write(f"crowd: {error}\n")
-        return 1
     return 0
 
 

@@ -25,7 +25,7 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet
+from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet, reporting
 from appliance.bench.load import RECEIVE_BYTES, Result, cpu_seconds, percentile, pin
 from appliance.bench.probe import print_answer
 
@@ -332,15 +332,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--window", type=int, default=1000, help="that of the link")
     parser.add_argument("--beside", type=int, action="append", default=[], metavar="PID")
     options = parser.parse_args(arguments)
-    try:
+    with reporting("drain"):
         device = LoadTarget.of(options)
         fleet = replace(device, port=options.fleet_port, pids=(options.fleet_pid,))
         pin_both(device.pids, [options.fleet_pid, *options.beside])
         with closing(Drain(device, fleet, options.messages, options.window)) as drain:
             serve(drain)
-    except (LoadError, OSError) as error:
-        sys.stderr.write(f"drain: {error}\n")
-        return 1
     return 0
 
 

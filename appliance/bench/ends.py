@@ -23,7 +23,7 @@ from dataclasses import asdict
 from importlib import import_module
 from typing import Any
 
-from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet
+from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet, reporting
 from appliance.bench.load import Result, cpu_seconds, percentile, pin
 
 TEXT_BYTES = 64
@@ -249,7 +249,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     pids = [os.getpid()] if options.role == "ros-listen" else options.pid
     meter = LatencyMeter(options.role, pids, options.seconds)
     pin(pids)  # both ends on one core, what is between on another
-    try:
+    with reporting(options.role):
         if options.role == "mqtt-send":
             mqtt_send(target, options.topic, options.rate, options.seconds)
         elif options.role == "ros-send":
@@ -260,9 +260,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             else:
                 ros_receive(options.topic, meter, options.seconds, options.image)
             sys.stdout.write(json.dumps(asdict(meter.result())) + "\n")
-    except (LoadError, OSError) as error:
-        sys.stderr.write(f"{options.role}: {error}\n")
-        return 1
     return 0
 
 

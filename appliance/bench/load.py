@@ -24,7 +24,14 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from appliance.bench.client import LoadClient, LoadError, LoadTarget, allow_files, publish_packet
+from appliance.bench.client import (
+    LoadClient,
+    LoadError,
+    LoadTarget,
+    allow_files,
+    publish_packet,
+    reporting,
+)
 
 STALL_SECONDS = 3.0  # without a delivery: the broker has lost messages, or has stalled
 RUN_SECONDS = 3.0  # of a run, unless said otherwise
@@ -603,7 +610,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     load = replace(CELLS[options.cell], **changes)
     if load.batch > load.window:
         parser.error("a batch larger than the window would never be sent")
-    try:
+    with reporting(options.cell):
         target = LoadTarget.of(options)
         spin = not options.no_pin and pin(target.pids)
         if load.idle:
@@ -612,9 +619,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             result = run_flood(options.cell, target, load, options.seconds, spin)
         else:
             result = run_messages(options.cell, target, load, options.seconds, spin)
-    except (LoadError, OSError) as error:
-        sys.stderr.write(f"{options.cell}: {error}\n")
-        return 1
     sys.stdout.write((json.dumps(asdict(result)) if options.json else describe(result)) + "\n")
     return 0
 

@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 
-from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet
+from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet, reporting
 from appliance.bench.load import percentile
 
 PAUSE_SECONDS = 0.002  # between two round trips, so that the probe itself is no load
@@ -76,14 +76,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     LoadTarget.add_options(parser)
     gc.disable()  # its pauses would be counted as the broker's
-    try:
+    with reporting("probe"):
         target = LoadTarget.of(parser.parse_args(arguments))
         with closing(LoadClient(target, f"bench-probe-{os.getpid()}")) as client:
             client.wait_connected()
             watch(client)
-    except (LoadError, OSError) as error:
-        sys.stderr.write(f"probe: {error}\n")
-        return 1
     return 0
 
 

@@ -484,7 +484,8 @@ def test_cpu_time_is_that_of_the_process() -> None:
 def test_a_refused_connection_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    assert load.main(["qos0-pair", "--port", str(port), "--no-pin"]) == 1
+    with pytest.raises(SystemExit, match="1"):
+        load.main(["qos0-pair", "--port", str(port), "--no-pin"])
     assert "qos0-pair: " in capsys.readouterr().err
 
 
