@@ -30,6 +30,8 @@ run: .venv/run.stamp
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
 
 # Most of a test's time is waiting, so three at a time; those that compare times come after them, alone.
+# Hundreds of processes are started: each of them compiles all its modules where that is not kept.
+test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/test.stamp $(INTEROP)/node_modules
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .

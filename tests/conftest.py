@@ -38,9 +38,23 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
     return report
 
 
+#: The files that take minutes. They go first, or the other workers end up waiting for the last.
+LONG = (
+    "test_compiled.py",
+    "test_containment.py",
+    "test_binary.py",
+    "test_bench.py",
+    "test_page_commands.py",
+    "test_dial.py",
+    "test_memory.py",
+    "test_durability.py",
+    "test_peers.py",
+)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The one that takes minutes goes first, or the others' workers end up waiting for it."""
-    items.sort(key=lambda item: item.path.name != "test_compiled.py")
+    order = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.name, len(LONG)))
 
 
 class Escaped(logging.Handler):

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import paho.mqtt.client as paho
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.access import (
@@ -480,7 +481,7 @@ def rules(pattern: bool) -> st.SearchStrategy[Rule]:
     )
 
 
-@settings(deadline=None, max_examples=150)
+@examples(150)
 @given(st.lists(rules(False), max_size=5), st.lists(rules(True), max_size=4), filters())
 def test_a_subscription_is_allowed_exactly_when_some_topic_could_be_delivered(
     own: list[Rule], patterns: list[Rule], filter: str
@@ -525,7 +526,7 @@ def acl_with(lines: list[tuple[Permission, list[str], bool, str]]) -> Acl:
     )
 
 
-@settings(deadline=None, max_examples=150)
+@examples(150)
 @given(
     LINES,
     st.sampled_from([NOBODY, Identity(None, "a"), Identity(None, "a/b"), Identity(None, "$SYS")]),
@@ -548,7 +549,7 @@ CLIENTS = [
 ]
 
 
-@settings(deadline=None, max_examples=150)
+@examples(150)
 @given(LINES, st.permutations(CLIENTS), filters())
 def test_what_is_decided_about_many_clients_is_what_the_rules_say_about_each(
     lines: list[tuple[Permission, list[str], bool, str]], clients: list[Identity], filter: str

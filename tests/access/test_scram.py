@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 from appliance_process import ApplianceProcess
 from command_line import run, set_up
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from raw_client import RawClient
 
@@ -326,7 +327,7 @@ def test_anything_is_answered_and_nothing_accepted(said: list[bytes]) -> None:
             assert isinstance(answer, bytes) and len(answer) < 2048 + 100
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(st.text(min_size=1, max_size=40), st.text(max_size=40))
 def test_whoever_has_the_password_gets_in(name: str, password: str) -> None:
     try:

@@ -40,8 +40,6 @@ from appliance.bench.load import Load, LoadPublisher, LoadSubscriber, MessageFlo
 from appliance.bench.peers import PeerError, Server, Site, find_mosquitto
 from appliance.mqtt.topics import check_filter, matches
 
-pytestmark = pytest.mark.timed
-
 MOSQUITTO = find_mosquitto(None)
 needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
 
@@ -559,6 +557,7 @@ def pretender() -> Iterator[Pretender]:
     broker.close()
 
 
+@pytest.mark.timed
 def test_the_probe_sees_how_long_a_broker_stands_still(
     pretender: Pretender, tmp_path: Path
 ) -> None:

@@ -330,6 +330,7 @@ class SlowStore:
             self.store.holding = True
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("qos", [1, 2])
 @pytest.mark.parametrize("size", [1, 3], ids=["to itself", "a ring of three"])
 @pytest.mark.parametrize(
@@ -395,9 +396,10 @@ def test_who_does_not_read_is_not_excused_by_a_slow_disk(
 # --- nobody waits for himself
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("qos", [1, 2])
-@pytest.mark.parametrize("window", [50, 100, 200, 1000], ids="{} in flight".format)
-@pytest.mark.parametrize("size", [1, 2, 3], ids=["to itself", "two", "a ring of three"])
+@pytest.mark.parametrize("window", [50, 200, 1000], ids="{} in flight".format)
+@pytest.mark.parametrize("size", [1, 3], ids=["to itself", "a ring of three"])
 def test_who_publish_to_each_other_do_not_wait_for_each_other(
     join: Join, broker: Broker, qos: int, size: int, window: int
 ):
@@ -414,6 +416,7 @@ def test_who_publish_to_each_other_do_not_wait_for_each_other(
     assert steps < 2000, "nobody waited for a time to be up"
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("qos", [1, 2])
 @pytest.mark.parametrize("window", [50, 200, 1000], ids="{} in flight".format)
 def test_all_may_publish_to_all(join: Join, broker: Broker, qos: int, window: int):
@@ -427,6 +430,7 @@ def test_all_may_publish_to_all(join: Join, broker: Broker, qos: int, window: in
     assert not broker.counters.publish_dropped
 
 
+@pytest.mark.lengthy
 def test_a_ring_of_clients_that_send_without_end_goes_on(join: Join, broker: Broker):
     """More is on the way than is looked at: then it is the time that ends the waiting."""
     broker.use(Limits(queue_bytes=1024 * 1024), broker.features)
@@ -485,6 +489,7 @@ def test_who_reads_too_slowly_is_waited_for_a_little_longer(join: Join, broker: 
     assert broker.counters.publish_dropped > 10_000
 
 
+@pytest.mark.lengthy
 def test_who_recovers_is_waited_for_again(join: Join, broker: Broker):
     """A reader that stood still for a moment loses what came then, and nothing later."""
     reader = join("reader", version=4)
@@ -538,6 +543,7 @@ def test_readers_that_conspire_cannot_stop_a_publisher(join: Join, broker: Broke
     assert publisher.acknowledged - 1020 > seconds / MESSAGE_PATIENCE * LEAST_COUNTED
 
 
+@pytest.mark.lengthy
 def test_to_come_back_is_not_to_read(join: Join, broker: Broker):
     """What was left of the patience with a reader is left when it comes back."""
     reader = join("reader", **lasting(5))
@@ -599,9 +605,10 @@ def test_an_absent_reader_is_not_waited_for(join: Join, broker: Broker):
 # --- everybody else goes on
 
 
+@pytest.mark.lengthy
 def test_only_who_publishes_to_the_slow_one_waits(join: Join, broker: Broker):
-    """Of 50 readers one is slow: the others have everything, and another publisher goes on."""
-    readers = [join(f"reader{number}", version=4) for number in range(50)]
+    """Of 15 readers one is slow: the others have everything, and another publisher goes on."""
+    readers = [join(f"reader{number}", version=4) for number in range(15)]
     for reader in readers:
         reader.subscribe("a", 1)
     readers[0].subscribe("b", 0)

@@ -673,6 +673,7 @@ def test_the_number_of_sessions_is_bounded(join: Join, broker: Broker):
     join("a")  # in place of its own
 
 
+@pytest.mark.lengthy
 def test_connecting_again_and_again_does_not_make_the_broker_grow(join: Join, broker: Broker):
     """Rule 3 of the design; deadlines that no longer hold are not kept for days."""
     for _ in range(3000):
@@ -1168,6 +1169,7 @@ def test_one_chunk_of_subscribes_does_not_make_the_broker_grow(join: Join, broke
     assert largest < 10_000_000
 
 
+@pytest.mark.lengthy
 def test_routes_of_invented_topics_are_not_kept_for_ever(join: Join):
     """Rule 3: the cache of a client is bounded, in routes and in bytes."""
     publisher = join("publisher")

@@ -448,6 +448,7 @@ def test_nothing_is_sent_again_on_the_same_connection(join: Join, broker: Broker
     assert not peer.session.inflight
 
 
+@pytest.mark.lengthy
 def test_packet_ids_in_use_are_passed_over(join: Join):
     """[MQTT-2.3.1-2], v5 [MQTT-2.2.1-4]"""
     peer = join()

@@ -15,7 +15,7 @@ import states
 import strangers
 from codec import Found
 
-SECONDS = 4.0
+SECONDS = 3.0
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,6 @@ def test_in_this_process(one_case: Callable[[random.Random], None]) -> None:
         seed += 1
 
 
-@pytest.mark.timed  # the canary's patience, and two seconds to log in
 @pytest.mark.parametrize("kind", [sessions.Siege, strangers.Strangers])
 def test_sessions(kind: type[sessions.Siege], tmp_path: Path) -> None:
     siege = kind(tmp_path)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from test_connection import (
     SAYABLE,
@@ -139,19 +140,19 @@ def conversations(draw) -> tuple[int, list[bytes]]:
 
 
 @given(conversations(), some_cuts)
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_any_split_gives_the_same_events_as_the_full_decoder(conversation, cuts):
     check_splits(connected, said_slowly, conversation, cuts)
 
 
 @given(conversations(), some_damage, some_cuts)
-@settings(max_examples=400, deadline=None)
+@examples(400)
 def test_damaged_bytes_are_refused_as_by_the_full_decoder(conversation, damage, cuts):
     check_damage(connected, said_slowly, conversation, damage, cuts)
 
 
 @given(st.binary(max_size=60), versions, st.booleans(), st.booleans())
-@settings(max_examples=500, deadline=None)
+@examples(500)
 def test_any_bytes_give_packets_or_one_error(data, version, method, before):
     client = (started if before else connected)(version, method=method)
     found = said(client, [data])

@@ -7,7 +7,8 @@ import sys
 from collections.abc import Iterable
 
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from test_properties import binaries, connects, packets, publishes, topics
 
@@ -237,19 +238,19 @@ def conversations(draw) -> tuple[int, list[bytes]]:
 
 
 @given(conversations(), some_cuts)
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_any_split_gives_the_same_events_as_the_full_decoder(conversation, cuts):
     check_splits(connected, said_slowly, conversation, cuts)
 
 
 @given(conversations(), some_damage, some_cuts)
-@settings(max_examples=500, deadline=None)
+@examples(500)
 def test_damaged_bytes_are_refused_as_by_the_full_decoder(conversation, damage, cuts):
     check_damage(connected, said_slowly, conversation, damage, cuts)
 
 
 @given(versions, publishes(4), st.integers(0), st.integers(0, 255))
-@settings(max_examples=500, deadline=None)
+@examples(500)
 def test_a_damaged_publish_between_two_whole_ones(version, packet, place, byte):
     """What is recognised by its head is looked at as closely as the first of its kind."""
     wire = packet.encode(version)
@@ -260,7 +261,7 @@ def test_a_damaged_publish_between_two_whole_ones(version, packet, place, byte):
 
 
 @given(st.binary(max_size=40), versions)
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_any_bytes_give_packets_or_one_error(data, version):
     connection = connected(version)
     assert same(said(connection, [data]), said_slowly(data, version))
@@ -268,7 +269,7 @@ def test_any_bytes_give_packets_or_one_error(data, version):
 
 
 @given(versions.flatmap(connects), versions, topics, binaries, st.lists(st.integers(0), max_size=3))
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_what_comes_behind_connect_waits_for_the_login(connect, version, topic, payload, cuts):
     connect.version = version
     if version == 4:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, invariant, rule
 
@@ -206,7 +207,7 @@ def split(wire: bytes) -> tuple[int, bytes]:
 
 
 @given(versioned_packets)
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_decode_is_the_inverse_of_encode(versioned):
     version, packet = versioned
     wire = packet.encode(version)
@@ -227,7 +228,7 @@ def decodes_or_refuses(first_byte: int, body: bytes, version: int) -> None:
 
 
 @given(st.integers(0, 255), st.binary(max_size=60), versions)
-@settings(max_examples=300, deadline=None)
+@examples(300)
 def test_any_bytes_are_a_packet_or_a_protocol_error(first_byte, body, version):
     decodes_or_refuses(first_byte, body, version)
 
@@ -239,7 +240,7 @@ edits = st.lists(
 
 
 @given(versioned_packets, edits, versions)
-@settings(max_examples=400, deadline=None)
+@examples(400)
 def test_damaged_packets_are_a_packet_or_a_protocol_error(versioned, edits, read_as):
     version, packet = versioned
     first_byte, body = split(packet.encode(version))
@@ -349,4 +350,4 @@ class Trees(RuleBasedStateMachine):
 
 
 TestTrees = Trees.TestCase
-TestTrees.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestTrees.settings = examples(150, stateful_step_count=40)

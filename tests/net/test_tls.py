@@ -18,7 +18,8 @@ from typing import Any
 import psutil
 import pytest
 from both_loops import event_loop_policy as event_loop_policy
-from hypothesis import HealthCheck, given, settings
+from examples import examples
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from waiting import PATIENCE, until
 
@@ -894,7 +895,7 @@ def chunks_of(data: bytes, cuts: list[int]) -> list[bytes]:
     return [piece for piece in [*pieces, data[start:]] if piece]
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[*HealthCheck])
+@examples(25, suppress_health_check=[*HealthCheck])
 @given(sizes=MESSAGES, cuts=CUTS, end=st.sampled_from(["notify", "half", "cut"]))
 def test_the_same_as_asyncios_own_transport(server, client, sizes, cuts, end):
     """The same records in the same chunks: the same data and answers."""
@@ -953,7 +954,7 @@ class Network:
     abort = write_eof = resume_reading = close
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[*HealthCheck])
+@examples(60, suppress_health_check=[*HealthCheck])
 @given(
     sizes=MESSAGES,
     cuts=CUTS,

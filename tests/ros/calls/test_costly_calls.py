@@ -8,9 +8,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.msg")
 import costly_calls
 
-pytestmark = pytest.mark.timed
-
-SECONDS = 2.0
+SECONDS = 1.0
 
 
 @pytest.fixture(scope="module")
