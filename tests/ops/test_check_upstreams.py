@@ -250,6 +250,14 @@ def test_what_a_kind_cannot_carry(
         assert each.startswith(start)
 
 
+def test_calls_of_3_1_1_need_room_for_a_token(here: Path) -> None:
+    rules = [{"topic": topic} for topic in ("a/_call", "b/_call", "b/_call/+", "c/#")]
+    told = troubles(here, version="3.1.1", in_=rules, out=[])
+    (text,) = [each for each in told if "3.1.1" in each]
+    assert text.startswith("warning in a/_call: ") and text.endswith("add: topic: a/_call/+")
+    assert not any("3.1.1" in each for each in troubles(here, in_=rules))
+
+
 def test_the_rates_of_a_kind_are_told(here: Path) -> None:
     told = [each.text for each in found(here, kind="aws-iot") if each.level == "ok"]
     assert "it sends at most 100 messages and 512 KiB a second" in told

@@ -8,6 +8,7 @@
     python tests/upstream --late
     python tests/upstream --calls 10000
     python tests/upstream --faults 10
+    python tests/upstream --links 200                     # one RabbitMQ is killed and started
 
 The exit code is 1 when anything is wrong, 2 when a program is missing. The seed that is printed
 determines what is done, but not its timing. With `--device mosquitto` mosquitto's bridge is tried
@@ -33,6 +34,7 @@ from upstream.faults import Faults
 from upstream.kills import FLEETS, Kills
 from upstream.late_commands import LateCommands
 from upstream.outage import Outage
+from upstream.reconnects import Reconnects
 
 #: Problems that are told in full.
 SHOWN = 20
@@ -53,10 +55,13 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     what.add_argument("--faults", type=float, metavar="MINUTES", help="random faults of the line")
     what.add_argument("--late", action="store_true", help="commands over a line that is silent")
     what.add_argument("--calls", type=int, metavar="N", help="calls from the fleet")
+    what.add_argument("--links", type=int, metavar="N", help="so many reconnect at once")
     parser.add_argument("--seed", type=int, default=secrets.randbits(32))
     parser.add_argument("--device", choices=DEVICES, default="appliance")
     kills = parser.add_argument_group("with --kills")
-    kills.add_argument("--fleet", choices=FLEETS, default="mosquitto")
+    kills.add_argument(
+        "--fleet", choices=FLEETS, help="(default: mosquitto; with --links, rabbitmq)"
+    )
     who = kills.add_mutually_exclusive_group()
     who.add_argument("--both", action="store_true", help="kill the fleet's broker, too")
     who.add_argument("--nobody", action="store_true", help="only cut the line")
@@ -79,8 +84,12 @@ def program(options: argparse.Namespace, directory: Path, say: Callable[[str], N
     common: dict[str, Any] = {"device": options.device, "say": say}
     if options.kills is not None:
         victims = "both" if options.both else "nobody" if options.nobody else "device"
-        kills = Kills(directory, options.seed, fleet=options.fleet, victims=victims, **common)
+        fleet = options.fleet or "mosquitto"
+        kills = Kills(directory, options.seed, fleet=fleet, victims=victims, **common)
         return lambda: kills.run(options.kills)
+    if options.links is not None:
+        fleet = options.fleet or "rabbitmq"
+        return Reconnects(directory, links=options.links, fleet=fleet, say=say).run
     if options.outage:
         return Outage(
             directory,

@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from upstream import __main__ as program
-from upstream import calls, kills, late_commands, outage
+from upstream import calls, kills, late_commands, outage, reconnects
 from upstream.calls import Calls
 from upstream.device import count
 from upstream.kills import Kills
 from upstream.late_commands import LateCommands
 from upstream.outage import Outage
+from upstream.reconnects import Reconnects
 
 
 def test_a_line_that_is_cut_loses_nothing_with_the_bridge_of_3_1_1(tmp_path: Path) -> None:
@@ -51,6 +52,14 @@ def test_calls_without_an_answer_are_told(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(calls, "PATIENCE", 2.0)
     report = Calls(tmp_path, device="mosquitto311", count=10, others=0).run()
     assert report.calls == 10 and "UNANSWERED" in report.problems[0]
+
+
+def test_links_that_take_too_long_to_come_back_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reconnects, "LIMIT", -1.0)
+    report = Reconnects(tmp_path, links=5, rounds=1, fleet="mosquitto").run()
+    assert ["5 links are online" in each for each in report.problems] == [True, True], report
 
 
 def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ from appliance import certs
 from appliance.access import AccessFileError, Acl
 from appliance.broker.ports import Action, Identity
 from appliance.config import Settings, TopicRoute, format_duration, format_size
-from appliance.mqtt.codec import V5
+from appliance.mqtt.codec import V5, V311
 from appliance.mqtt.topics import overlaps
 from appliance.ops.check.link_rules import link_rules
 from appliance.ops.check.rights import written
 from appliance.ops.finding import Finding
 from appliance.ops.init import call_topics
-from appliance.upstream.answers import new_token
+from appliance.upstream.answers import new_token, reply_filter
 from appliance.upstream.limits import KINDS, kind_of_host
 from appliance.upstream.rules import InRule, UpstreamSettings
 from appliance.upstream.sessions import in_client_id, kept_client_id, out_client_id
@@ -195,10 +195,27 @@ def _kind(settings: Settings, link: UpstreamSettings) -> Iterator[Finding]:
     if link.out and not limits.ordered:
         text = f"{link.kind} does not promise the order of a topic's messages"
         yield Finding("warning", subject, text)
+    yield from _calls(link)
     rate, volume = limits.rates(link.rate, link.bytes_per_second)
     if (rate, volume) != (link.rate, link.bytes_per_second) and rate and volume:
         text = f"it sends at most {rate:g} messages and {format_size(int(volume))} a second"
         yield Finding("ok", subject, text)
+
+
+def _calls(link: UpstreamSettings) -> Iterator[Finding]:
+    """Rules of calls that carry none in MQTT 3.1.1, where a call has a token as its last level."""
+    if link.version != V311:
+        return
+    filters = [rule.remote_filter for rule in link.inward]
+    for rule in link.inward:
+        with_token = f"{rule.remote_filter}/+"
+        is_call = reply_filter(rule.remote_filter) is not None
+        if is_call and not any(overlaps(each, with_token) for each in filters):
+            text = (
+                f"in {rule.topic}: with MQTT 3.1.1 a caller there appends a token, to be answered "
+                f"at _reply; add: topic: {rule.topic}/+"
+            )
+            yield Finding("warning", _subject(link), text)
 
 
 def _too_long(link: UpstreamSettings) -> Iterator[Finding]:
