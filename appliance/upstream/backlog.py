@@ -13,6 +13,9 @@ of them is next, what is dropped when the backlog is full, and what is in memory
 
 A single message may exceed each of these, as it could not be sent otherwise.
 
+What is larger than the fleet's broker takes on this connection moves to a queue of its own, `HELD`,
+and is handed out once on each connection that takes more than the largest before.
+
 Each message that was offered is in the end sent, dropped for a reason, or set aside:
 `offered + restored = sent + dropped + set aside + waiting`, see `BacklogCounts`.
 """
@@ -46,7 +49,7 @@ from appliance.upstream.rule_queue import (
     RuleQueue,
     size_left,
 )
-from appliance.upstream.rules import PRIORITIES, BacklogLimits, OutRule
+from appliance.upstream.rules import PRIORITIES, BacklogLimits, OutRule, Priority
 from appliance.upstream.set_aside import AsideRecords, SetAside
 
 log = logging.getLogger(__name__)
@@ -91,6 +94,9 @@ MOST_DROPPED: Final = 1000
 #: The largest Message Expiry Interval, in seconds.
 _LONGEST_EXPIRY: Final = 0xFFFF_FFFF
 
+#: The name of the queue of messages that are too large for now; no filter has such a character.
+HELD: Final = "\0too large"
+
 # The first byte of rows in the table of latest records.
 _LATEST: Final = b"L"
 _LATER: Final = b"R"
@@ -116,7 +122,8 @@ class BacklogCounts:
 
     `waiting` includes those `in_flight`, and so do `bytes`. `oldest_at` is when the oldest of them
     was published, in seconds of the journals' clock. `restored` waited at the start. `dropped` is
-    by rule and reason; of those that were set aside, `aside` are kept.
+    by rule and reason; of those that were set aside, `aside` are kept. Of those that wait, `held`
+    are larger than the fleet's broker takes now.
     """
 
     offered: int = 0
@@ -130,6 +137,7 @@ class BacklogCounts:
     lanes: tuple[int, int, int] = (0, 0, 0)
     oldest_at: float | None = None
     aside: int = 0
+    held: int = 0
 
 
 class Backlog:
@@ -196,6 +204,8 @@ class Backlog:
         self._repeated: set[int] = set()
         self._full_since: int | None = None
         self._counts = BacklogCounts()
+        #: The bytes of a packet up to which the held messages are known to be too large.
+        self._held_at = 0
 
         #: By rule: the number of its journal; and the key of the row that says so.
         self._numbers: dict[str, int] = {}
@@ -342,7 +352,9 @@ class Backlog:
         """The queue of a rule that may not be in the configuration any more."""
         queue = self._queues.get(name)
         if queue is None:
-            queue = self._queues[name] = RuleQueue(OutRule(name, "", ""))
+            # What cannot be sent now is the first to be dropped.
+            priority: Priority = "low" if name == HELD else "normal"
+            queue = self._queues[name] = RuleQueue(OutRule(name, "", "", priority=priority))
             queue.configured = False
         return queue
 
@@ -726,9 +738,13 @@ class Backlog:
 
     # --- out --------------------------------------------------------------------------------------
 
-    def connected(self) -> None:
-        """A connection can be sent messages from now on."""
+    def connected(self, packet_size: float = math.inf) -> None:
+        """A connection can be sent messages from now on, of at most that size."""
         self._online = True
+        held = self._queues.get(HELD)
+        if held is not None:
+            more = packet_size > self._held_at
+            held.passes = held.messages if more else len(held.again)
 
     def next(self, now: float) -> Entry | None:
         """The next message to be sent; None when there is none, or when it may not be sent yet.
@@ -838,6 +854,8 @@ class Backlog:
         found: RuleQueue | None = None
         for queues in self._lanes:
             for queue in queues:
+                if not queue.passes:
+                    continue  # of what waits here nothing may be sent
                 if queue.waiting or queue.again or queue.latest or queue.live or queue.behind:
                     if found is None:
                         found = queue
@@ -849,6 +867,8 @@ class Backlog:
             or found.latest
             or found.live
             or found.bucket is not None
+            or found.overflow  # some may have been replaced
+            or found.name == HELD
             or (found.behind and found.reading is None and 2 * found.loaded <= self._share)
         ):
             return None, 0
@@ -870,7 +890,7 @@ class Backlog:
             stored: RuleQueue | None = None
             live: RuleQueue | None = None
             for queue in self._lanes[lane]:
-                if not queue.messages:
+                if not queue.messages or not queue.passes:
                     continue
                 bucket = queue.bucket
                 if bucket is not None and bucket.due(now) > now:
@@ -904,6 +924,7 @@ class Backlog:
         return None
 
     def _take_stored(self, queue: RuleQueue, now: float) -> Entry | None:
+        queue.passes -= 1
         if queue.again:
             entry = queue.again.popleft()
             record = entry.record
@@ -1164,6 +1185,25 @@ class Backlog:
         delay = min(LONGEST_RETRY, FIRST_RETRY * 2 ** min(entry.attempts - 1, 10))
         heapq.heappush(self._later, (now + delay, entry.record.number, entry))
 
+    def hold(self, entry: Entry, packet_size: int) -> bool:
+        """The fleet's broker takes only smaller packets now: keep it until one takes more, and send
+        what follows. False for what only counts as long as nothing newer has come, or is not
+        stored."""
+        if entry.topic is not None or (entry.part is None and entry.key is None):
+            return False
+        self._held_at = max(self._held_at, packet_size)
+        held = self._orphaned(HELD)
+        if not held.messages:
+            held.passes = 0
+            self._sort()
+        record = entry.record
+        data = record.encode()
+        self._append(held, record.topic, data, record.number, awaited=False)
+        self._count(held, 1, len(data))
+        self._land(entry)
+        self._end(entry)
+        return True
+
     def set_aside(self, entry: Entry, reason: str, now: float) -> None:
         """The fleet's broker will never take it: keep it for the user, and send what follows."""
         if entry.state != IN_FLIGHT:
@@ -1284,6 +1324,7 @@ class Backlog:
             (lanes[0], lanes[1], lanes[2]),
             min(oldest, default=None),
             len(self._aside),
+            self._queues[HELD].messages if HELD in self._queues else 0,
         )
 
     def aside(self) -> list[SetAside]:

@@ -6,6 +6,7 @@ rate delays nobody else, and a drop is counted for it without reading what is dr
 
 from __future__ import annotations
 
+import math
 from array import array
 from bisect import bisect_left, bisect_right, insort
 from collections import OrderedDict, deque
@@ -176,6 +177,8 @@ class RuleQueue:
         #: False when the configuration does not contain the rule any more.
         self.configured = True
         self.bucket: TokenBucket | None = None
+        #: How many more of its messages may be handed out on this connection.
+        self.passes = math.inf
         #: Messages that wait or are in flight, and their bytes.
         self.messages = 0
         self.bytes = 0

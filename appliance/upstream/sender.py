@@ -71,7 +71,8 @@ class Sender:
         self._name = name
         self._backlog = backlog
         self._clock = clock
-        self._limits = limits
+        #: Of the kind of broker, and of the present connection.
+        self._of_kind = self._limits = limits
         #: The oldest message in flight when the last connection ended, and of how many in a row
         #: that was so.
         self._stuck_on = -1
@@ -91,7 +92,7 @@ class Sender:
         """A connection is up, with these limits."""
         self._limits = limits
         self._topics.clear()
-        self._backlog.connected()
+        self._backlog.connected(limits.packet_size)
 
     def send(self, connection: FleetConnection[Entry | None]) -> bool:
         """Hand messages to the connection; True if there may be more for another turn."""
@@ -139,6 +140,10 @@ class Sender:
         size = HEADER_SIZE + topic_size + len(properties) + len(payload)
         if why or size > limits.packet_size:
             why = limits.unsendable(topic, size)
+            # The kind of broker never takes it; or this connection, and perhaps a later one does.
+            is_for_now = not self._of_kind.unsendable(topic, size)
+            if is_for_now and self._backlog.hold(entry, limits.packet_size):
+                return
             self._set_aside(entry, f"the fleet's broker does not take it: {why}")
             return
         qos = min(entry.qos, limits.qos)

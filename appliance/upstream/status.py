@@ -44,6 +44,7 @@ class LinkStatus:
     held_back: int = 0
     dropped: dict[str, dict[str, int]] = field(default_factory=dict)
     set_aside: int = 0
+    too_large: int = 0
     refused_filters: list[str] = field(default_factory=list)
     denied: dict[str, str] = field(default_factory=dict)
     advice: str | None = None
@@ -63,6 +64,11 @@ def warnings_of(status: dict[str, Any]) -> Iterator[str]:
         yield f"the access rules do not let it read {name}: {reason}"
     for name in status["refused_filters"]:
         yield f"the fleet's broker refuses the subscription to {name}"
+    if status["too_large"]:
+        yield (
+            "messages that are larger than the fleet's broker takes now (Maximum Packet Size) wait "
+            f"until it takes more: {status['too_large']}"
+        )
     if status["set_aside"]:
         yield f"messages that the fleet's broker never takes were set aside: {status['set_aside']}"
 

@@ -410,10 +410,10 @@ class Uplink:
             status.unacknowledged += channel.connection.unacknowledged
             status.held_back += channel.inward.waiting if channel.inward is not None else 0
         for (rule, reason), count in counts.dropped.items():
-            status.dropped.setdefault(rule, {})[reason.value] = count
+            status.dropped.setdefault(rule.lstrip("\0"), {})[reason.value] = count
         for (rule, verdict), count in self._in_counters.dropped.items():
             status.dropped.setdefault(rule, {})[verdict.value] = count
-        status.set_aside = counts.aside
+        status.set_aside, status.too_large = counts.aside, counts.held
         status.refused_filters = [each for line in self._lines for each in line.refused_filters]
         status.denied = dict(self._out.denied)
         status.advice = bottleneck(status)

@@ -699,3 +699,57 @@ def test_merged_segments_are_dropped_when_all_in_them_was_replaced() -> None:
     assert link.dropped() == {"replaced": 8} and link.counts().waiting == 12 + 4
     sent = [each for each in link.drain() if not each.startswith("x")]
     assert sent == ["a2", "b2", "c2", "d2"]
+
+
+def test_what_is_too_large_for_now_waits_for_a_connection_that_takes_it() -> None:
+    link = Link(rule(), rule("l", keep="latest"))
+
+    def visit(limit: int) -> list[str]:
+        """Send what is not longer than `limit`, on a connection that takes no more."""
+        link.backlog.connected(limit)
+        sent: list[str] = []
+        while (entry := link.next()) is not None:
+            name = entry.record.payload.decode()
+            if len(name) > limit and link.backlog.hold(entry, limit):
+                continue
+            assert len(name) <= limit
+            sent.append(name.rstrip())
+            link.backlog.settle(entry)
+        link.backlog.rewind()
+        link.backlogs.commit()
+        return sent
+
+    large = [str(number).ljust(200 + number % 2 * 1000) for number in range(3000)]
+    for name in large:
+        link.offer(name)
+        link.offer("small")
+    assert visit(100) == ["small"] * 3000
+    assert (link.counts().held, link.counts().waiting) == (3000, 3000)
+    link.offer("more")
+    assert visit(100) == ["more"]  # they are not tried again
+    assert visit(500) == [str(number) for number in range(0, 3000, 2)]
+    assert visit(500) == []
+    link.restart()
+    assert link.counts().held == 1500
+    assert visit(500) == []
+    assert visit(5000) == [str(number) for number in range(1, 3000, 2)]
+    assert link.counts().waiting == 0 and not link.dropped()
+    link.offer("x", of=1)  # of which only the latest counts
+    link.backlog.connected(0)
+    entry = link.next()
+    assert entry is not None and not link.backlog.hold(entry, 0)
+
+
+def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no_more() -> None:
+    link = Link()
+    link.backlog.connected(10)
+    link.offer("x" * 50)
+    entry = link.next()
+    assert entry is not None and link.backlog.hold(entry, 10)
+    assert link.next() is None
+    link.backlog.rewind()
+    for _ in range(2):
+        link.backlog.connected(100)
+        again = link.next()
+        assert again is not None and link.next() is None
+        link.backlog.rewind()

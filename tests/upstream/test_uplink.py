@@ -279,7 +279,8 @@ async def test_limits_of_connack_hold(tmp_path: Path, limits: dict[Property, obj
         await until(lambda: rig.status().connected)
         await publish(rig, "r2d2/events/door", *[b"%d" % n for n in range(20)], b"x" * 300)
         await publish(rig, "r2d2/state/battery", b"1", retain=True)
-        await rig.drained()
+        await until(lambda: rig.status().waiting == rig.status().too_large)
+        assert rig.status().too_large == (Property.MAXIMUM_PACKET_SIZE in limits)
         assert not fleet.faults
         assert payloads(fleet, "fleet/r2d2/events/door")[:20] == [b"%d" % n for n in range(20)]
 
@@ -395,3 +396,23 @@ async def test_whatever_the_fleet_does_harms_nobody_else(tmp_path: Path, name: s
                 await rig.drained()
                 assert set(payloads(fleet, "fleet/r2d2/events/door")) == {b"1", b"2", b"3"}
             assert not fleet.errors
+
+
+async def test_a_small_limit_for_a_while_loses_nothing(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await fleet.visited()
+        await fleet.stop()
+        fleet.limits = {Property.MAXIMUM_PACKET_SIZE: 300}
+        await fleet.start()
+        await fleet.visited(2)
+        large = [str(number).encode().ljust(500) for number in range(20)]
+        await publish(rig, "r2d2/events/door", *large, b"small")
+        await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == [b"small"])
+        assert rig.status().too_large == rig.status().waiting == 20
+        assert not rig.status().set_aside
+        await fleet.stop()
+        fleet.limits = {}
+        await fleet.start()
+        await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == [b"small", *large])
+        await rig.drained()
+        assert not fleet.faults
