@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
@@ -71,7 +72,8 @@ class ChannelOwner(Protocol):
 class Channel:
     """One connection; its transport calls it, and `owner` is told what happens.
 
-    `subscriptions` are made when the broker has accepted the connection; `late` is the least `late`
+    `subscriptions` are made when the broker has accepted the connection, `one_by_one` each only
+    when the one before is answered; `late` is the least `late`
     of the rules on this connection in seconds, None without one. `is_kept`: the broker keeps the
     session when the connection ends.
     """
@@ -84,6 +86,7 @@ class Channel:
         late: float | None,
         *,
         is_kept: bool,
+        one_by_one: bool = False,
     ) -> None:
         self.is_kept = is_kept
         self.version = settings.version
@@ -95,7 +98,10 @@ class Channel:
         self._broker = owner.broker
         self._entries = owner.entries
         self._loop = owner.entries.loop
-        self._subscriptions = subscriptions
+        self._unasked = deque(subscriptions)
+        self._one_by_one = one_by_one
+        #: The topic filters that the broker was asked for last.
+        self.asked: list[str] = []
         self._refused: list[tuple[Subscription, int]] = []
         self._transport: UpstreamTransport | None = None
         self._ping_interval = math.inf if late is None else max(late / 2, SHORTEST_PING)
@@ -166,11 +172,6 @@ class Channel:
         self._finish()
 
     @property
-    def filters(self) -> list[str]:
-        """The topic filters that it subscribes to."""
-        return [each.filter for each in self._subscriptions]
-
-    @property
     def client_id(self) -> str:
         """The client id there: the broker may have assigned another one."""
         granted = self.connection.granted
@@ -206,7 +207,7 @@ class Channel:
         elif isinstance(event, Subscribed):
             self._refused += [each for each in event.results if each[1] >= 0x80]
             if event.complete:
-                self._subscribed()
+                self._subscribe_on()
         elif isinstance(event, Challenged):
             self.connection.close(
                 ReasonCode.BAD_AUTHENTICATION_METHOD, "it asks for more than a token"
@@ -215,16 +216,20 @@ class Channel:
     def _open(self) -> None:
         self.inward = self._owner.receive(self)
         self._owner.opened(self)
-        if not self._subscriptions:
-            self._subscribed()
-            return
-        self._refused = self.connection.subscribe(self._subscriptions)
-        if len(self._refused) == len(self._subscriptions):
-            self._subscribed()
+        self._subscribe_on()
         if self._ping_interval < math.inf:
             self._ping()
 
-    def _subscribed(self) -> None:
+    def _subscribe_on(self) -> None:
+        """Ask for all subscriptions, or for the next one; tell when all are answered."""
+        while self._unasked:
+            count = 1 if self._one_by_one else len(self._unasked)
+            some = [self._unasked.popleft() for _ in range(count)]
+            self.asked = [each.filter for each in some]
+            refused = self.connection.subscribe(some)
+            self._refused += refused
+            if len(refused) < count:
+                return  # the answers come
         self.is_subscribed = True
         self._owner.subscribed(self, self._refused)
 

@@ -27,8 +27,13 @@ from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
 from appliance.upstream.limits import KINDS, alpn
 from appliance.upstream.presence import Presence
-from appliance.upstream.refusals import ending_advice, unanswered_filters
+from appliance.upstream.refusals import (
+    ending_advice,
+    subscription_advice,
+    unanswered_filters,
+)
 from appliance.upstream.transport import UpstreamTransport
+from appliance.upstream.unanswered import UnansweredFilters
 from appliance.upstream.versions import ServerVersions
 
 if TYPE_CHECKING:
@@ -73,10 +78,13 @@ class Line:
         self.attempts = 0
         self.connections = 0
         self.refused_filters: list[str] = []
+        #: The filters that the present connection does not ask for, see `UnansweredFilters`.
+        self.left_out: list[str] = []
         self._link = link
         self._settings = link.settings
         self._loop = link.entries.loop
         self._versions = ServerVersions(link.settings.version)
+        self._unanswered = UnansweredFilters()
         self._backoff = Backoff(len(link.settings.servers), random.random)
         self._ending: asyncio.Future[Ending] | None = None
         self._task: asyncio.Task[None] | None = None
@@ -176,12 +184,19 @@ class Line:
         link = self._link
         self._tell_server(self._settings.servers[dialled.position])
         version = self._versions.of(dialled.position)
+        self.left_out = self._unanswered.left_out(self._loop.time())
+        subscriptions = [
+            each
+            for each in link.subscriptions(version, is_kept=self.is_kept)
+            if each.filter not in self.left_out
+        ]
         channel = Channel(
             link,
             link.connect_settings(version, dialled.credentials, is_kept=self.is_kept),
-            link.subscriptions(version, is_kept=self.is_kept),
+            subscriptions,
             link.least_late(is_kept=self.is_kept),
             is_kept=self.is_kept,
+            one_by_one=self._unanswered.one_by_one,
         )
         self.channel = channel
         ended = self._ending = self._loop.create_future()
@@ -306,7 +321,8 @@ class Line:
                 ending, self._settings, self._settings.servers[server], self._client_id
             )
             if ending.is_close and not ending.is_new and not channel.is_subscribed:
-                advice = unanswered_filters(channel.filters)
+                advice = unanswered_filters(channel.asked)
+                self._leave_out(channel.asked)
             return self._failed(f"{ending.text}; {advice}" if advice else ending.text)
         text = ending.text
         if self._backoff.is_contested(now):
@@ -323,6 +339,22 @@ class Line:
                     f"{wait:.0f} s); has another client the client id {client_id} as well?"
                 )
         return self._report_problem(text, wait)
+
+    def _leave_out(self, asked: list[str]) -> None:
+        """The broker has closed the connection upon SUBSCRIBE, perhaps again and again."""
+        found = self._unanswered.closed(asked, self._loop.time())
+        if found is not None:
+            log.warning(
+                "%s: the fleet's broker closes the connection upon the subscription to %s: %s",
+                self,
+                quote(found),
+                subscription_advice(ReasonCode.NOT_AUTHORIZED, self._settings, found),
+            )
+
+    def on_subscribed(self, refused: list[str]) -> None:
+        """The broker has answered all subscriptions, and refused these."""
+        self._unanswered.answered()
+        self.refused_filters = refused + self.left_out
 
     def _fall_back(self, server: int) -> float:
         """The broker does not know MQTT 5."""

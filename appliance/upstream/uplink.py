@@ -266,7 +266,7 @@ class Uplink:
     def subscribed(self, channel: Channel, refused: list[tuple[Subscription, int]]) -> None:
         """See `ChannelOwner`."""
         line = self._line_of(channel)
-        line.refused_filters = [each.filter for each, _ in refused]
+        line.on_subscribed([each.filter for each, _ in refused])
         for each, code in refused:
             log.warning(
                 "%s: the fleet's broker refuses the subscription to %s: %s; %s",
