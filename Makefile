@@ -10,6 +10,7 @@
 PYTHON ?= python3
 PORT ?= 8883
 PLAIN_PORT ?= 1883
+WORKERS ?= 3
 BIN := .venv/bin
 INTEROP := tests/interop/mqttjs
 
@@ -29,7 +30,7 @@ run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
 
-# Most of a test's time is waiting, so three at a time; those that compare times come after them, alone.
+# Most of a test's time is waiting, so three at a time (on two cores); those that compare times come after them, alone.
 # Hundreds of processes are started: each of them compiles all its modules where that is not kept.
 test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/test.stamp $(INTEROP)/node_modules
@@ -37,7 +38,7 @@ test: .venv/test.stamp $(INTEROP)/node_modules
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not timed'
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not timed'
 	$(BIN)/pytest -m timed
 
 compiled: .venv/run.stamp

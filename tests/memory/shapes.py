@@ -27,13 +27,13 @@ MOST = 1.5
 
 #: Small, so that a shape is full within seconds; what nothing here is to be stopped by is not.
 LIMITS: dict[str, Any] = {
-    "memory": 16 * MIB,
+    "memory": 8 * MIB,
     "user": UserLimits(
-        memory=16 * MIB, retained_messages=10_000_000, retained_bytes=8 * MIB, stored=1 << 40
+        memory=8 * MIB, retained_messages=10_000_000, retained_bytes=4 * MIB, stored=1 << 40
     ),
-    "queue_bytes": 16 * MIB,
+    "queue_bytes": 8 * MIB,
     "queue_messages": 10_000_000,
-    "retained_bytes": 8 * MIB,
+    "retained_bytes": 4 * MIB,
     "retained_messages": 10_000_000,
     "subscriptions": 1_000_000,
     "sessions": 10_000_000,
@@ -341,7 +341,7 @@ def wills(filling: Filling) -> None:
 @shape()
 def logins_that_wait(filling: Filling) -> None:
     """The largest CONNECT, of which nobody knows yet who sent it."""
-    for number in range(400):
+    for number in range(200):
         peer = Peer(filling.broker)
         pairs = {Property.USER_PROPERTY: [("", WIDE + "x" * 1000)] * 32}
         will = Will("a", bytes(30_000), properties=pairs)  # type: ignore[arg-type]
