@@ -11,7 +11,6 @@ import contextlib
 import itertools
 import logging
 import math
-import multiprocessing
 import os
 import socket
 import struct
@@ -23,7 +22,7 @@ from multiprocessing.connection import Connection
 from typing import Any, cast
 
 import uvloop
-from witness import HEAD_END, PONG, UPGRADE, Over, Target, frame, take_frame
+from witness import HEAD_END, PONG, UPGRADE, Over, ServingProcess, Target, frame, take_frame
 
 from appliance.mqtt.packets import V5, V311, Connect, Packet
 
@@ -41,8 +40,6 @@ LATEST = 1.0
 
 #: Connections that are opened concurrently.
 AT_A_TIME = 32
-
-_spawn = multiprocessing.get_context("spawn")
 
 
 class Line(asyncio.Protocol):
@@ -354,14 +351,11 @@ def encode4(*packets: Packet) -> bytes:
     return encode(V311, *packets)
 
 
-class Attacker:
+class Attacker(ServingProcess):
     """The attacker's process; it runs one attack after the other."""
 
     def __init__(self) -> None:
-        self._pipe, end = _spawn.Pipe()
-        self._process = _spawn.Process(target=_serve, args=(end,), daemon=True)
-        self._process.start()
-        end.close()
+        super().__init__(_serve)
 
     def attack(
         self, name: str, target: Target, ways: tuple[Over, ...], seconds: float
@@ -371,12 +365,6 @@ class Attacker:
         assert self._pipe.poll(seconds + 3 * PATIENCE), "the attack does not come to its end"
         counts, failure = self._pipe.recv()
         return counts, failure
-
-    def end(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.join()
-        self._pipe.close()
 
 
 def _serve(pipe: Connection) -> None:

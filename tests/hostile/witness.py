@@ -11,6 +11,7 @@ import socket
 import ssl
 import struct
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -117,14 +118,27 @@ class Report:
         return self.round_trips[min(int(part * len(self.round_trips)), len(self.round_trips) - 1)]
 
 
-class Witness:
+class ServingProcess:
+    """A process that runs `serve`, and the pipe to it."""
+
+    def __init__(self, serve: Callable[[Connection], None]) -> None:
+        self._pipe, end = _spawn.Pipe()
+        self._process = _spawn.Process(target=serve, args=(end,), daemon=True)
+        self._process.start()
+        end.close()
+
+    def end(self) -> None:
+        """Leave nothing running."""
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+
+
+class Witness(ServingProcess):
     """The process; it measures from `begin` to `report`, and may do so again."""
 
     def __init__(self) -> None:
-        self._pipe, end = _spawn.Pipe()
-        self._process = _spawn.Process(target=_serve, args=(end,), daemon=True)
-        self._process.start()
-        end.close()
+        super().__init__(_serve)
 
     def begin(self, target: Target, over: Over) -> None:
         """Connect; returns when round trips are being measured."""
@@ -138,12 +152,6 @@ class Witness:
         assert self._pipe.poll(4 * GIVE_UP), "the healthy client does not come to its end"
         report: Report = self._pipe.recv()
         return report
-
-    def end(self) -> None:
-        """Leave nothing running."""
-        self._process.kill()
-        self._process.join()
-        self._pipe.close()
 
 
 class _Stream:

@@ -34,6 +34,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
 
 from appliance_process import HOST, MOSQUITTO, ROBOT, ApplianceProcess, free_ports  # noqa: E402
+from upstream.relay import Relay  # noqa: E402
 from waiting import PATIENCE, until  # noqa: E402
 
 from appliance.host.environment import for_other_programs  # noqa: E402
@@ -85,56 +86,6 @@ class Outcome:
     problem: str
 
 
-class Network:
-    """What is between the clients and the appliance: it can hold what comes, or be gone."""
-
-    def __init__(self, port):
-        self.far = port
-        self.flowing = asyncio.Event()
-        self.flowing.set()
-        self.tasks = set()
-        self.server = None
-        (self.port,) = free_ports(1)
-
-    async def mend(self):
-        self.server = await asyncio.start_server(self._serve, HOST, self.port, family=2)
-
-    async def cut(self):
-        if self.server is None:
-            return
-        self.server.close()
-        self.server = None
-        for task in self.tasks:
-            task.cancel()
-        await asyncio.gather(*self.tasks, return_exceptions=True)
-        self.tasks.clear()
-
-    async def _serve(self, reader, writer):
-        self.tasks.add(asyncio.current_task())
-        far = None
-        try:
-            far = await asyncio.open_connection(HOST, self.far)
-            copies = [
-                asyncio.create_task(self._copy(reader, far[1])),
-                asyncio.create_task(self._copy(far[0], writer)),
-            ]
-            self.tasks.update(copies)
-            await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
-        except (OSError, asyncio.CancelledError):
-            pass  # it is cut
-        finally:
-            if far is not None:
-                far[1].transport.abort()
-            writer.transport.abort()
-
-    async def _copy(self, reader, writer):
-        with contextlib.suppress(ConnectionError):
-            while data := await reader.read(65536):
-                await self.flowing.wait()
-                writer.write(data)
-                await writer.drain()
-
-
 class Robot:
     """The appliance, the network before it, and a node that is moved."""
 
@@ -157,7 +108,8 @@ class Robot:
         }
         settings["bridge"] = {"topics": [route]}
         config.write_text(yaml.safe_dump(settings))
-        self.network = Network(self.ports[1])
+        self.network = Relay(self.ports[1])
+        (self.network.port,) = free_ports(1)
         #: By client.
         self.moved: dict[int, list[Moved]] = {}
         self.stops = 0
@@ -173,7 +125,7 @@ class Robot:
         await self.peer.do("subscribe", "/cmd_vel", TWIST)
         await until(lambda: self.stops, "the stop message of the start")
         if is_reached:
-            await self.network.mend()
+            await self.network.start()
 
     def append(self, received):
         """The node has received a message."""
@@ -204,7 +156,7 @@ class Robot:
         return self.appliance.log.count(" connected: MQTT ")
 
     async def stop(self):
-        await self.network.cut()
+        await self.network.stop()
         await self.peer.stop()
         await asyncio.to_thread(self.appliance.stop)
 
@@ -378,21 +330,21 @@ class Scenarios:
     async def network_gone(self):
         """Connections are lost, and for a time there are none."""
         await self._steer()
-        await self.robot.network.cut()
+        await self.robot.network.stop()
         await self._all_done(1)
         await asyncio.sleep(AWAY)
         before = self.robot.connections
-        await self.robot.network.mend()
+        await self.robot.network.start()
         await self._all_back(before)
         return await self._steer_again("network gone")
 
     async def network_stalls(self):
         """Connections live, and nothing gets through for a time."""
         await self._steer()
-        self.robot.network.flowing.clear()
+        self.robot.network.silence()
         await self._all_done(1)
         await asyncio.sleep(AWAY / 2)
-        self.robot.network.flowing.set()
+        self.robot.network.release()
         return await self._steer_again("network stalls")
 
     async def never_seen(self):
@@ -403,7 +355,7 @@ class Scenarios:
             client.do("drive", int(RATE * STEERED_ON), RATE)
         await self._all_done(1)
         await asyncio.sleep(AWAY)
-        await self.robot.network.mend()
+        await self.robot.network.start()
         await self._all_back(before)
         return await self._steer_again("never seen before")
 

@@ -97,22 +97,22 @@ async def test_every_field_comes_back(harness: Harness, tmp_path: Path) -> None:
     await twin.stop()
 
 
-async def _retain(harness: Harness) -> set[str]:
-    """Retain more messages than may be in flight; returns their topics."""
+async def _replaying(harness: Harness) -> tuple[set[str], Peer]:
+    """Topics of more retained messages than may be in flight, and a client that they go to."""
     topics = [f"a/{number}" for number in range(10)]
     publisher = await harness.join("publisher")
     for number, topic in enumerate(topics, 1):
         publisher.send(Publish(topic, b"x", 1, retain=True, packet_id=number))
-    return {*topics}
+    client = await harness.join("client", **lasting(5))
+    client.send(Subscribe(1, [Subscription("a/#", 1)]))
+    return {*topics}, client
 
 
 async def test_retained_messages_that_were_not_sent_yet_are_sent_behind_the_restart(
     harness: Harness, tmp_path: Path
 ) -> None:
     """The client has its SUBACK and will find its session: it does not subscribe again."""
-    topics = await _retain(harness)
-    client = await harness.join("client", **lasting(5))
-    client.send(Subscribe(1, [Subscription("a/#", 1)]))
+    topics, client = await _replaying(harness)
     await harness.written()
     sent = [packet for packet in client.received() if isinstance(packet, Publish)]
     assert len(sent) == harness.limits.inflight
@@ -132,9 +132,7 @@ async def test_what_was_asked_for_first_is_sent_behind_the_restart_whatever_was_
     harness: Harness, tmp_path: Path
 ) -> None:
     """It would be sent without a restart: who asks for nothing more takes nothing back."""
-    topics = await _retain(harness)
-    client = await harness.join("client", **lasting(5))
-    client.send(Subscribe(1, [Subscription("a/#", 1)]))
+    topics, client = await _replaying(harness)
     client.send(Subscribe(2, [Subscription("a/#", 1, retain_handling=2)]))
     await harness.written()
     twin = await restarted(harness, tmp_path / "twin")

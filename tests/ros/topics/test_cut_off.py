@@ -18,6 +18,7 @@ from appliance.host.environment import for_other_programs
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
 from ros2_harness import TWIST, Peer
+from upstream.relay import Relay
 
 pytestmark = [pytest.mark.timed, pytest.mark.usefixtures("isolated_domain")]
 
@@ -128,65 +129,23 @@ class Driver:
         await self.process.wait()
 
 
-class Network:
-    """What is between the client and the appliance: while `holding`, nothing gets through."""
-
-    def __init__(self, port):
-        self.port = port
-        self.flowing = asyncio.Event()
-        self.flowing.set()
-        self.tasks = set()
-
-    async def __aenter__(self):
-        self.server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
-        return self
-
-    async def __aexit__(self, *_):
-        self.server.close()
-        for task in self.tasks:
-            task.cancel()
-        await asyncio.gather(*self.tasks, return_exceptions=True)
-
-    @property
-    def near(self):
-        return self.server.sockets[0].getsockname()[1]
-
-    async def _serve(self, reader, writer):
-        self.tasks.add(asyncio.current_task())
-        try:
-            far = await asyncio.open_connection("127.0.0.1", self.port)
-            there = asyncio.create_task(self._copy(reader, far[1]))
-            back = asyncio.create_task(self._copy(far[0], writer))
-            self.tasks |= {there, back}
-            await asyncio.wait([there, back], return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            far[1].transport.abort()
-            writer.transport.abort()
-
-    async def _copy(self, reader, writer):
-        while data := await reader.read(65536):
-            await self.flowing.wait()
-            writer.write(data)
-            await writer.drain()
-
-
 @pytest.mark.parametrize(("version", "qos"), [("5", "0"), ("3.1.1", "1")])
 async def test_a_client_whose_network_is_gone_for_a_while_and_that_is_killed_then(
     robot, version, qos
 ):
-    async with Network(robot.appliance.port) as network:
-        driver = Driver(robot, network.near, version, qos)
+    async with Relay(robot.appliance.port) as network:
+        driver = Driver(robot, network.port, version, qos)
         await driver.start()
         try:
             await until(lambda: len(robot.numbers()) > 10, "commands")
-            network.flowing.clear()
+            network.silence()
             cut = time.monotonic()
             last = max(robot.numbers())
             took = await robot.stopped_after(cut - 1)
             print(f"{version}: the stop message came {took * 1000:.0f} ms after the last command")
             assert AFTER - 0.1 < took < AFTER + TOLERANCE + PATIENCE
             await asyncio.sleep(1)
-            network.flowing.set()
+            network.release()
             # The network's computer has answered all the time: the connection is the same.
             flowing = time.monotonic()
             await until(
