@@ -7,6 +7,8 @@
     python tests/upstream --outage --size "1 GiB" --messages 9000000 --restarts
     python tests/upstream --late
     python tests/upstream --calls 10000
+    python tests/upstream --late --ros --version 3.1.1    # with a real node of ROS
+    python tests/upstream --calls 1000 --ros              # and 100 goals
     python tests/upstream --faults 10
     python tests/upstream --links 200                     # one RabbitMQ is killed and started
 
@@ -76,6 +78,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     outage.add_argument("--queue", type=int, default=0, help="messages of mosquitto's bridge")
     late = parser.add_argument_group("with --late")
     late.add_argument("--silence", type=float, default=10.0, help="seconds (default: 10)")
+    late.add_argument("--version", choices=("5", "3.1.1"), default="5", help="of MQTT, with --ros")
+    parser.add_argument("--ros", action="store_true", help="--late, --calls: with nodes of rclpy")
     return parser.parse_args(arguments)
 
 
@@ -103,9 +107,22 @@ def program(options: argparse.Namespace, directory: Path, say: Callable[[str], N
         ).run
     if options.faults is not None:
         return Faults(directory, options.seed, seconds=options.faults * 60, **common).run
+    if options.ros:
+        return ros_program(options, directory, common)
     if options.late:
         return LateCommands(directory, silence=options.silence, **common).run
     return Calls(directory, count=options.calls, **common).run
+
+
+def ros_program(options: argparse.Namespace, directory: Path, common: dict[str, Any]) -> Any:
+    """The same where the robot's side is in ROS, which is imported only then."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "ros"))
+    from upstream.ros_trials import RosCalls, RosCommands
+
+    if options.calls is not None:
+        return RosCalls(directory, count=options.calls, **common).run
+    late = RosCommands(directory, silence=options.silence, version=options.version, **common)
+    return late.run
 
 
 def main(arguments: list[str] | None = None) -> int:

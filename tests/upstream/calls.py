@@ -25,6 +25,8 @@ from upstream.trial import Trial
 #: Calls of one caller that wait for their answers.
 WINDOW = 50
 
+ANSWER = b'{"ok": true}'
+
 #: Seconds for all answers, behind the last call.
 PATIENCE = 60.0
 
@@ -50,7 +52,11 @@ class Report:
 class Caller:
     """An operator with a topic for answers of its own."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(
+        self, name: str, target: str = "reset/_call", payload: bytes = b"{}", window: int = WINDOW
+    ) -> None:
+        self.target, self.payload, self.window = target, payload, window
+        self.payloads: list[bytes] = []
         self.topic = f"answers/{name}"
         self.name = name
         self.client: MqttClient
@@ -67,13 +73,14 @@ class Caller:
         data = (message.properties or {}).get(Property.CORRELATION_DATA, b"?")
         correlation = data.decode() if isinstance(data, bytes) else "?"
         self.came.append((message.topic, correlation))
+        self.payloads.append(message.payload)
         if correlation in self.calls:
             self.times.append(time.monotonic() - self.calls[correlation])
 
     async def call(self, count: int) -> None:
         for number in range(count):
             deadline = time.monotonic() + PATIENCE
-            while len(self.calls) - len(self.came) >= WINDOW:
+            while len(self.calls) - len(self.came) >= self.window:
                 if time.monotonic() > deadline:
                     return  # what is missing is told in the end
                 await asyncio.sleep(0.001)
@@ -83,13 +90,16 @@ class Caller:
                 Property.RESPONSE_TOPIC: self.topic,
                 Property.CORRELATION_DATA: correlation.encode(),
             }
-            self.client.publish(f"{THERE}reset/_call", b"{}", 1, properties=properties)
+            topic = f"{THERE}{self.target}"
+            self.client.publish(topic, self.payload, 1, properties=properties)
 
 
 class Calls(Trial[Report]):
     """`callers` of our own with `count` calls in all, and `others` of mosquitto_rr."""
 
     delay = 0.005
+    call_topic = "reset/_call"
+    window = WINDOW
 
     def __init__(
         self,
@@ -102,13 +112,14 @@ class Calls(Trial[Report]):
     ) -> None:
         super().__init__(directory, Report(), **common)
         self.count = count
-        self.callers = [Caller(f"operator{number}") for number in range(callers)]
+        self.callers = [
+            Caller(f"operator{number}", self.call_topic, window=self.window)
+            for number in range(callers)
+        ]
         self.others = others
 
     async def carry_out(self, relay: Relay, fleet: int) -> None:
-        robot = await self.dial("service")
-        await robot.subscribe(f"{HERE}+/_call")
-        robot.on_message = lambda message: self._serve(robot, message)
+        robot = await self.serve()
         for caller in self.callers:
             await caller.connect(fleet)
         await self._wait_for_the_link(fleet)
@@ -119,10 +130,26 @@ class Calls(Trial[Report]):
             await until(self._complete, timeout=PATIENCE)
         await asyncio.sleep(0.5)  # more than was asked for
         await asyncio.to_thread(self._call_with_mosquitto, fleet)
+        await self.call_more(fleet)
         for caller in self.callers:
             caller.client.abort()
-        robot.abort()
+        if robot is not None:
+            robot.abort()
         self._add_up()
+
+    async def serve(self) -> MqttClient | None:
+        """Who answers the calls: a client of the robot's broker."""
+        robot = await self.dial("service")
+        await robot.subscribe(f"{HERE}+/_call")
+        robot.on_message = lambda message: self._serve(robot, message)
+        return robot
+
+    async def call_more(self, fleet: int) -> None:
+        """Other calls than these."""
+
+    def is_answer(self, payload: bytes) -> bool:
+        """Whether it is what a call is answered."""
+        return payload == ANSWER
 
     def _complete(self) -> bool:
         return all(len(each.came) >= len(each.calls) for each in self.callers)
@@ -135,7 +162,7 @@ class Calls(Trial[Report]):
         if isinstance(topic, str):
             correlation = properties.get(Property.CORRELATION_DATA)
             more = {} if correlation is None else {Property.CORRELATION_DATA: correlation}
-            robot.publish(topic, b'{"ok": true}', 1, properties=more)
+            robot.publish(topic, ANSWER, 1, properties=more)
 
     async def _wait_for_the_link(self, port: int) -> None:
         robot = await self.dial("probe")
@@ -156,7 +183,7 @@ class Calls(Trial[Report]):
             return
         self.say(f"{self.others} calls with mosquitto_rr")
         where = ["-h", HOST, "-p", str(port), "-u", USER, "-P", PASSWORD]
-        what = ["-V", "5", "-t", f"{THERE}reset/_call", "-m", "{}", "-W", "10"]
+        what = ["-V", "5", "-t", f"{THERE}{self.call_topic}", "-m", "{}", "-W", "10"]
         for number in range(self.others):
             done = subprocess.run(
                 [program, *where, *what, "-e", f"answers/rr/{number}"],
@@ -166,7 +193,7 @@ class Calls(Trial[Report]):
                 check=False,
             )
             self.report.calls += 1
-            if done.returncode or done.stdout.strip() != '{"ok": true}':
+            if done.returncode or not self.is_answer(done.stdout.strip().encode()):
                 self.report.problems.append(
                     f"mosquitto_rr {number}: {done.returncode} {done.stdout}{done.stderr}"
                 )
@@ -183,3 +210,6 @@ class Calls(Trial[Report]):
             report.times += caller.times
             calls = dict.fromkeys(caller.calls, caller.topic)
             report.problems += account.answers(calls, caller.came, {caller.topic})
+            wrong = [each for each in caller.payloads if not self.is_answer(each)]
+            if wrong:
+                report.problems.append(f"{len(wrong)} calls are answered {wrong[0][:100]!r}")

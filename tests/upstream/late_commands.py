@@ -93,7 +93,10 @@ class LateCommands(Trial[Report]):
         self.report.sent += 1
         number = self.report.sent
         self._sent[number] = time.monotonic()
-        operator.publish(f"{THERE}cmd_vel", b"%d {}" % number, number % 2)
+        operator.publish(f"{THERE}cmd_vel", self._payload(number), number % 2)
+
+    def _payload(self, number: int) -> bytes:
+        return b"%d {}" % number
 
     async def _drive(self, operator: MqttClient, seconds: float) -> None:
         for _ in range(int(seconds * RATE)):

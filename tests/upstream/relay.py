@@ -154,6 +154,8 @@ class _Pipe:
         while self._queue and not (self.way.silent or self.forgotten):
             if not (self.target.open and self.target.writable):
                 break
+            if self.target.transport.is_closing():  # by an error in what was just written
+                break
             due, data = self._queue[0]
             now = self._loop.time()
             due = max(due, self._free_at)
