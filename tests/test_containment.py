@@ -854,6 +854,7 @@ async def _busy(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 #: Entries that MQTT load does not pass, and the tests that let them fail.
 ELSEWHERE = {
+    "doctor.turn": "ops/test_doctor_links.py",
     **dict.fromkeys(
         (
             "ros.close",

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final, cast
 
+from appliance.config.urls import ServerUrl
 from appliance.mqtt.codec import MAX_VARINT, V5, Properties, Property
-from appliance.upstream.rules import BrokerKind
+from appliance.upstream.rules import BrokerKind, UpstreamSettings, UpstreamTls
 
 #: The largest MQTT packet: a fixed header of five bytes, and the largest Remaining Length.
 LARGEST_PACKET: Final = 5 + MAX_VARINT
@@ -172,6 +173,13 @@ _HOSTS: Final[dict[str, BrokerKind]] = {
 def kind_of_host(host: str) -> BrokerKind | None:
     """The kind of broker that a host is by its name; None for most."""
     return next((kind for end, kind in _HOSTS.items() if host.lower().endswith(end)), None)
+
+
+def dialled_tls(settings: UpstreamSettings, server: ServerUrl) -> UpstreamTls:
+    """How TLS is spoken with one server of a link."""
+    has_login = settings.login.username is not None
+    offered = alpn(settings.kind, server.port, settings.tls.alpn, has_login)
+    return replace(settings.tls, alpn=tuple(offered))
 
 
 def alpn(kind: BrokerKind, port: int, configured: tuple[str, ...], has_login: bool) -> list[str]:

@@ -12,7 +12,7 @@ import contextlib
 import logging
 import math
 import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,7 +25,7 @@ from appliance.upstream.channel import Channel
 from appliance.upstream.credentials import Credentials, read_credentials
 from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
-from appliance.upstream.limits import KINDS, alpn
+from appliance.upstream.limits import KINDS, dialled_tls
 from appliance.upstream.presence import Presence
 from appliance.upstream.refusals import (
     ending_advice,
@@ -165,12 +165,7 @@ class Line:
         self.attempts += 1
         login = settings.login
         credentials = await in_thread(link.entries, partial(read_credentials, login))
-        tls = replace(
-            settings.tls,
-            alpn=tuple(
-                alpn(settings.kind, server.port, settings.tls.alpn, login.username is not None)
-            ),
-        )
+        tls = dialled_tls(settings, server)
         proxy = None if settings.proxy is None else parse_proxy(settings.proxy)
         transport = await dial(server, tls, proxy, link.surroundings())
         return _Dialled(position, transport, credentials)

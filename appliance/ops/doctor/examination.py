@@ -11,6 +11,7 @@ from appliance.config import ConfigError, Settings
 from appliance.ops import check
 from appliance.ops.control import ControlError, NotRunningError, ask
 from appliance.ops.doctor.computer import clock, disk, files, memory
+from appliance.ops.doctor.links import links
 from appliance.ops.doctor.ports import ports
 from appliance.ops.doctor.ros import ros
 from appliance.ops.doctor.secrets import certificates, permissions
@@ -52,6 +53,7 @@ def examine(path: Path | None) -> Iterator[Finding]:
     parts: list[Part] = [ports, clock, disk, memory, files]
     if settings is not None:
         parts[2:2] = [certificates, permissions]
+        parts.append(links)
     for part in (*parts, ros):
         try:
             yield from part(known, running)
