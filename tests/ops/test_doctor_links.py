@@ -99,7 +99,7 @@ def test_without_links_nothing_is_dialled(tmp_path: Path) -> None:
     assert examined(tmp_path) == []
 
 
-async def test_a_fault_in_a_turn_ends_nothing() -> None:
+async def test_a_fault_in_a_turn_ends_nothing(escaped: list[str]) -> None:
     class Member:
         def take_turn(self) -> None:
             raise ZeroDivisionError
@@ -108,3 +108,4 @@ async def test_a_fault_in_a_turn_ends_nothing() -> None:
     alone.queue_turn(Member())
     faults = alone.entries.faults
     await until(lambda: faults.by_entry == {"doctor.turn": 1})
+    escaped.clear()
