@@ -36,6 +36,10 @@ from appliance.upstream.transport import UpstreamTransport
 #: bring the next one nearer.
 CHECK_INTERVAL: Final = 1.0
 
+#: Seconds after a check in which nothing is checked anew: it asks the system, which costs more than
+#: a message, and what it looks for takes seconds.
+CHECKED_FOR: Final = 0.05
+
 #: Bytes that are written and not sent from which on nothing more is read: answers to what was read,
 #: as of messages no more than a few packets are written at a time.
 MOST_UNSENT: Final = 1 << 20
@@ -109,6 +113,7 @@ class Channel:
         #: Why nothing is read now; empty while it is.
         self._holds: set[str] = set()
         self._timer: asyncio.TimerHandle | None = None
+        self._checked_at = -math.inf
         self._ping_timer: asyncio.TimerHandle | None = None
         self._turn: asyncio.TimerHandle | None = None
         self._turn_at = 0.0
@@ -258,6 +263,9 @@ class Channel:
 
     def _check_later(self, now: float) -> None:
         assert self._transport is not None
+        if self._timer is not None and now < self._checked_at + CHECKED_FOR:
+            return
+        self._checked_at = now
         due = self.connection.tick(now, self._transport.unsent)
         if self.connection.ended is not None:
             self._finish()

@@ -19,9 +19,9 @@ from appliance.upstream.transport import WRITE_PORTION
 
 log = logging.getLogger(__name__)
 
-#: Messages that are sent in one turn of the event loop: two milliseconds of work, then others have
-#: theirs.
-SENT_PER_TURN: Final = 256
+#: Messages that are sent in one turn of the event loop: half a millisecond of work. Then others
+#: have theirs.
+SENT_PER_TURN: Final = 64
 
 #: Bytes of a PUBLISH beside its topic, properties and payload, at most.
 HEADER_SIZE: Final = 9

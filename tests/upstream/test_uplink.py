@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from appliance.mqtt.packets import (
     Subscription,
 )
 from appliance.mqtt.reason import ReasonCode
+from appliance.upstream import channel as channel_module
 from appliance.upstream.sender import WITHOUT_PROGRESS
 from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
@@ -328,6 +330,19 @@ async def test_rules_with_offline_keep_have_a_session_that_the_fleet_keeps(tmp_p
         filters = {visit.connect.client_id: visit.filters for visit in fleet.visits}
         assert "fleet/r2d2/mission/#" in filters["r2d2-keep"]
         assert "fleet/r2d2/mission/#" not in filters["r2d2"]
+
+
+async def test_a_silent_fleet_is_noticed_though_most_rounds_check_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(channel_module, "CHECKED_FOR", math.inf)  # the timer alone checks
+    scenario = SCENARIOS["pingresp-never"]
+    async with FakeFleet() as fleet:
+        scenario.prepare(fleet)
+        async with running(Rig(tmp_path, fleet.port, keep_alive="1 s")) as rig:
+            await publish(rig, "r2d2/events/door", *[b"%d" % number for number in range(100)])
+            await scenario.outcome(fleet)
+            await until(lambda: len(fleet.visits) > 1, "another connection")
 
 
 async def test_high_goes_before_what_waits(tmp_path: Path) -> None:
