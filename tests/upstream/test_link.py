@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from appliance_process import MOSQUITTO, MosquittoProcess
 from broker.conftest import FakeAccess, Peer
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from waiting import PATIENCE as TEST_PATIENCE
 
@@ -396,7 +397,7 @@ def test_what_is_published_is_what_the_codec_encodes(version, qos, retain, size)
     ),
     st.sampled_from(VERSIONS),
 )
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_any_messages_are_encoded_as_by_the_codec(messages, version):
     fake = Fake(version).open()
     packet_id = 0
@@ -1066,7 +1067,7 @@ def server_streams(draw) -> list[bytes]:
 
 
 @given(server_streams(), st.sampled_from(VERSIONS), st.booleans())
-@settings(max_examples=400, deadline=None)
+@examples(400)
 def test_any_bytes_only_end_the_connection(chunks, version, opened):
     fake = Fake(version)
     if opened:
