@@ -72,6 +72,8 @@ class LateCommands(Trial[Report]):
         self.silence = silence
         self.rounds = rounds
         self._sent: dict[int, float] = {}
+        #: From when to when nothing was sent that may come.
+        self._silences: list[tuple[float, float]] = []
 
     async def carry_out(self, relay: Relay, fleet: int) -> None:
         device = self.device
@@ -118,7 +120,10 @@ class LateCommands(Trial[Report]):
             way = ("down", None, "up")[number % 3]
             self.say(f"silent ({way or 'both ways'}) for {self.silence:g} s")
             relay.silence(way)  # type: ignore[arg-type]
+            began = time.monotonic()
             await self._drive(operator, self.silence)
+            if way != "up":  # what was sent comes behind it, and is at least so old
+                self._silences.append((began, time.monotonic() - LATE))
             relay.release()
             await self._drive(operator, 1)
             await self._drive_until_it_comes(operator, "after the silence")
@@ -141,5 +146,12 @@ class LateCommands(Trial[Report]):
         if offline:
             text = f"{len(offline)} of {OFFLINE} sent while the link was away CAME:"
             report.problems.append(f"{text} {account.spans(offline)}")
+        silent = [
+            each.number
+            for each in report.came
+            if any(begin < each.sent < end for begin, end in self._silences)
+        ]
+        if silent:
+            report.problems.append(f"sent in a silence, and CAME: {account.spans(silent)}")
         if len(report.came) < report.sent / 10:
             report.problems.append(f"only {len(report.came)} of {report.sent} came at all")

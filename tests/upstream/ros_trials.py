@@ -73,6 +73,11 @@ class RosCommands(LateCommands):
             operator.abort()
         finally:
             await peer.stop()
+        status = await asyncio.to_thread(self.device.status)
+        assert status is not None
+        dropped = status["dropped"].get(f"{THERE}cmd_vel", {})
+        if not dropped.get("late"):  # the route would refuse some of them as well
+            self.report.problems.append(f"the link has taken all that CAME: it dropped {dropped}")
         slow = [at - last for last, at in self.stops if at - last > STOPPED + SLACK]
         if slow:
             self.report.problems.append(
