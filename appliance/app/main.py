@@ -21,6 +21,7 @@ import uvloop
 
 from appliance.access import AccessFileError, FileAccess, LoginPolicy, no_user
 from appliance.app import status, wiring
+from appliance.app.links import Links
 from appliance.app.reload import Reload, ReloadError, ReloadParts
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -196,7 +197,9 @@ class App:
             self._stack.push_async_callback(plugins.shutdown)
         self._start_bridge(loop)
         self._reload = Reload(
-            ReloadParts(settings, access, tls, broker, listeners, self.bridge, self.audit)
+            ReloadParts(
+                settings, access, tls, broker, listeners, self.bridge, self.audit, self._links
+            )
         )
         self._status = status.Status(
             status.StatusParts(
@@ -313,17 +316,10 @@ class App:
 
     def _start_upstreams(self, store: SessionStore) -> None:
         """Connect to the fleets' brokers in the background."""
-        if not self.settings.upstreams:
-            return  # what is imported here takes a tenth of a second
-        from appliance.upstream import settings as upstream_settings
-        from appliance.upstream.uplink import Uplink, UplinkParts
-
-        parts = UplinkParts(self.broker, self._entries, store.backlogs, self._listeners.scheduler)
-        for settings in upstream_settings.upstreams(self.settings):
-            uplink = Uplink(settings, parts)
-            self._stack.push_async_callback(uplink.stop)
-            uplink.start()
-            self.upstreams.append(uplink)
+        self._links = Links(self.broker, self._entries, store.backlogs, self._listeners.scheduler)
+        self.upstreams = self._links.running
+        self._stack.push_async_callback(self._links.stop)
+        self._links.start(self.settings)
 
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tick every TICK seconds; publish `$SYS` every `broker.sys_interval`."""

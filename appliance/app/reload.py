@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from appliance import config
 from appliance.access import AccessFileError, Changes, FileAccess, Rules
 from appliance.app import wiring
+from appliance.app.links import Links
 from appliance.broker.broker import Broker
 from appliance.certs import CertificateError, LoadedTls, TlsContexts
 from appliance.certs.settings import tls_files, tls_policies
@@ -49,7 +50,6 @@ NEEDS_RESTART: Final = (
     "bridge.ros_arguments",
     "bridge.use_sim_time",
     "bridge.diagnostics",
-    "upstreams",
 )
 
 
@@ -68,6 +68,7 @@ class ReloadParts:
     listeners: Listeners
     bridge: Bridge | None
     audit: Audit | None
+    links: Links
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +185,8 @@ class Reload:
             logs.setup(settings.log.level, settings.log.levels, settings.log.format)
         parts.broker.rules_changed()
         parts.broker.flush()
+        # Links that the routes change are among them: how late a command may be depends on these.
+        changed += await parts.links.replace(settings)
         if parts.audit is not None and changed:
             parts.audit.changed(", ".join(changed), **asdict(rights))
         return changed

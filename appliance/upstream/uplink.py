@@ -137,8 +137,11 @@ class Uplink:
             line.start()
         self._report()
 
-    async def stop(self) -> None:
-        """Say that the robot is offline, and disconnect; what waits stays in the backlog."""
+    async def stop(self, *, is_removed: bool = False) -> None:
+        """Say that the robot is offline, and disconnect; what waits stays in the backlog.
+
+        Of one that `is_removed` from the configuration nothing stays retained here.
+        """
         if self._clock is not None:
             self._clock.cancel()
         await asyncio.gather(*(line.stop() for line in self._lines))
@@ -146,6 +149,8 @@ class Uplink:
             if timer is not None:
                 timer.cancel()
         self._report()
+        if is_removed:
+            self._publish_here(b"", b"")
         self._out.detach()
         self.broker.flush()
 
@@ -440,19 +445,19 @@ class Uplink:
 
     def _report(self) -> None:
         """Publish the status here, where it has changed."""
-        session = self._out.answering
-        if session is None:
-            return
         self._reported_at = self._loop.time()
         status = self.status()
         payload = orjson.dumps(status.as_json())
         if payload != self._reported:
             self._reported = payload
-            self.broker.publish(
-                Message(self.settings.status_here, payload, 0, True, _JSON), session
-            )
-            topic = f"$SYS/broker/connection/{self.settings.client_id}/state"
-            self.broker.publish(
-                Message(topic, b"1" if status.connected else b"0", 0, True), session
-            )
-            self.broker.flush()
+            self._publish_here(payload, b"1" if status.connected else b"0")
+
+    def _publish_here(self, status: bytes, state: bytes) -> None:
+        """Publish both topics that tell here how the link is, retained; empty deletes them."""
+        session = self._out.answering
+        if session is None:
+            return
+        about = self.settings.status_here, f"$SYS/broker/connection/{self.settings.client_id}/state"
+        self.broker.publish(Message(about[0], status, 0, True, _JSON), session)
+        self.broker.publish(Message(about[1], state, 0, True), session)
+        self.broker.flush()
