@@ -45,9 +45,9 @@ LONG = (
     "test_binary.py",
     "test_bench.py",
     "test_page_commands.py",
-    "test_dial.py",
-    "test_memory.py",
     "test_durability.py",
+    "test_memory.py",
+    "test_old_commands.py",
     "test_peers.py",
 )
 
