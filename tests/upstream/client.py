@@ -158,7 +158,9 @@ class MqttClient(asyncio.Protocol):
         elif isinstance(packet, (Suback, Unsuback)):
             self._settle(packet.packet_id, packet)
         elif isinstance(packet, Pingresp):
-            self._pings.pop(0).set_result(None)
+            asked = self._pings.pop(0)
+            if not asked.done():  # nobody waits any more
+                asked.set_result(None)
         elif isinstance(packet, Connack):
             self._connected.set_result(packet)
         elif isinstance(packet, Disconnect):

@@ -336,11 +336,13 @@ class Kills:
             # The fleet's broker sends again as well, when its client comes back.
             again = self.relay.accepted + sink.connects
             report.problems += account.order(topic, numbers, again)
-            if self.victims != "both" and sink is self.there_sink:
+            if sink is self.there_sink:
+                # A killed broker may have forgotten as much of what its client has acknowledged.
+                forgetful = 2 if self.victims == "both" else 1
                 report.problems += account.repetition(
                     topic,
                     sink.received.get(topic, []),
                     sorted(self.killed_at + self.relay.ended_at),
-                    self.window,
-                    self.device.linger + 0.5,
+                    self.window * forgetful,
+                    self.device.linger * forgetful + 0.5,
                 )
