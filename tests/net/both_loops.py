@@ -10,8 +10,10 @@ import uvloop
 
 @pytest.fixture(
     scope="module",
-    params=[asyncio.DefaultEventLoopPolicy(), uvloop.EventLoopPolicy()],
-    ids=["asyncio", "uvloop"],
+    params=[
+        pytest.param(asyncio.DefaultEventLoopPolicy(), id="asyncio", marks=pytest.mark.lengthy),
+        pytest.param(uvloop.EventLoopPolicy(), id="uvloop"),  # the appliance's own
+    ],
 )
 def event_loop_policy(request: pytest.FixtureRequest) -> asyncio.AbstractEventLoopPolicy:
     return request.param  # type: ignore[no-any-return]

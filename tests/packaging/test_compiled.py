@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -57,8 +58,8 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
     pytest_command = Path(sys.executable).with_name("pytest")  # `-m pytest` would import from here
     run = subprocess.run(
         [
-            *(str(pytest_command), "-q", "-x", "-p", "no:cacheprovider"),
-            *("-m", "not patches and not timed and not lengthy", "-k", "not asyncio", *TESTS),
+            *(str(pytest_command), "-x", "-p", "no:cacheprovider"),
+            *("-m", "not patches and not timed and not lengthy", *TESTS),
         ],
         env=environment,
         cwd=ROOT,
@@ -67,4 +68,5 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
         stderr=subprocess.STDOUT,
     )
     assert run.returncode == 0, run.stdout[-4000:]
-    assert " passed" in run.stdout or "[100%]" in run.stdout
+    passed = re.search(r"^(\d+) passed", run.stdout, re.MULTILINE)
+    assert passed and int(passed[1]) > 1000, run.stdout[-1000:]
