@@ -753,3 +753,20 @@ def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no
         again = link.next()
         assert again is not None and link.next() is None
         link.backlog.rewind()
+
+
+def test_many_at_once_leave_out_what_was_replaced_or_is_held() -> None:
+    link = Link(rule(keep="latest"), online=False)
+    for number in range(12):
+        link.offer("x".ljust(500_000), f"big{number}")
+    link.drain()  # what is in memory
+    for number in range(12):
+        link.offer("x".ljust(500_000), f"big{number}")
+    for text in ("old", "new"):
+        link.offer(text, "t")
+    found: list[str] = []
+    while entries := link.backlog.take(link.backlogs.time, 100, 1 << 30) or link.take(1):
+        for entry in entries:
+            found.append(entry.record.payload.decode().rstrip())
+            link.backlog.settle(entry)
+    assert [each for each in found if each != "x"] == ["new"]
