@@ -331,6 +331,11 @@ def test_late_where_nothing_is_commanded(here: Path) -> None:
     assert troubles(here, in_=[{"topic": "cmd_vel"}]) == []
 
 
+def test_calls_may_be_late_as_well(here: Path) -> None:
+    keys = {"in_": [{"topic": "reset/_call", "late": "2 s"}], "bridge": {"services": ["/reset"]}}
+    assert not any("late is for commands" in each for each in troubles(here, **keys))
+
+
 def test_commands_that_the_fleets_broker_would_queue(here: Path) -> None:
     in_ = [{"topic": "cmd_vel", "offline": "keep"}]
     (told,) = troubles(here, bridge={"topics": [DRIVE]}, in_=in_)
