@@ -14,14 +14,15 @@ import math
 import random
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from appliance.config.urls import ServerUrl, parse_proxy
 from appliance.mqtt.codec import V5, quote
+from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
-from appliance.upstream.agreement import EndedBy, Ending
+from appliance.upstream.agreement import ConnectSettings, EndedBy, Ending
 from appliance.upstream.backoff import Backoff
-from appliance.upstream.channel import Channel
+from appliance.upstream.channel import Channel, ChannelOwner
 from appliance.upstream.credentials import Credentials, read_credentials
 from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
@@ -32,12 +33,10 @@ from appliance.upstream.refusals import (
     subscription_advice,
     unanswered_filters,
 )
-from appliance.upstream.transport import UpstreamTransport
+from appliance.upstream.rules import UpstreamSettings
+from appliance.upstream.transport import Surroundings, UpstreamTransport
 from appliance.upstream.unanswered import UnansweredFilters
 from appliance.upstream.versions import ServerVersions
-
-if TYPE_CHECKING:
-    from appliance.upstream.uplink import Uplink
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +57,32 @@ LEAVING: Final = 5.0
 _UNDIALLED: Final = (DialError, OSError, RuntimeError, ValueError)
 
 
+class LineOwner(ChannelOwner, Protocol):
+    """The link that a line belongs to. `is_kept` says for which of its connections it is asked."""
+
+    settings: UpstreamSettings
+
+    def client_id(self, *, is_kept: bool) -> str:
+        """The client id that the connection asks for."""
+
+    def connect_settings(
+        self, version: int, credentials: Credentials, *, is_kept: bool
+    ) -> ConnectSettings:
+        """What CONNECT asks for."""
+
+    def subscriptions(self, version: int, *, is_kept: bool) -> list[Subscription]:
+        """What the connection subscribes to."""
+
+    def least_late(self, *, is_kept: bool) -> float | None:
+        """The least age in seconds for which what comes on the connection is late; or None."""
+
+    def surroundings(self) -> Surroundings:
+        """For the transport."""
+
+    def publish_state(self, channel: Channel, presence: Presence) -> None:
+        """Say on the channel whether the robot is online."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Dialled:
     """A connection to the server at a position in `servers`, on which nothing was sent yet."""
@@ -70,7 +95,7 @@ class _Dialled:
 class Line:
     """One of a link's connections, over and over; a task of the event loop."""
 
-    def __init__(self, link: Uplink, *, is_kept: bool) -> None:
+    def __init__(self, link: LineOwner, *, is_kept: bool) -> None:
         self.is_kept = is_kept
         self.channel: Channel | None = None
         self.server = ""
@@ -88,6 +113,7 @@ class Line:
         self._backoff = Backoff(len(link.settings.servers), random.random)
         self._ending: asyncio.Future[Ending] | None = None
         self._task: asyncio.Task[None] | None = None
+        self._restart: asyncio.TimerHandle | None = None
         self._is_stopping = False
         self._is_causeless = False
         #: The first server, dialled while the present connection is with another one.
@@ -114,11 +140,15 @@ class Line:
 
     def _start_again(self) -> None:
         """A fault has ended the task: go on a little later."""
-        self._link.entries.later("upstream.restart", AGAIN, self.start, failed=self._start_again)
+        self._restart = self._link.entries.later(
+            "upstream.restart", AGAIN, self.start, failed=self._start_again
+        )
 
     async def stop(self) -> None:
         """Disconnect, and dial no more."""
         self._is_stopping = True
+        if self._restart is not None:
+            self._restart.cancel()
         channel = self.channel
         if channel is not None:
             self._say_offline(channel)
@@ -153,7 +183,12 @@ class Line:
             try:
                 dialled = await self._dial(self._backoff.server)
             except _UNDIALLED as error:
+                self._versions.failed(self._backoff.server)
                 return self._failed(str(error))
+        lost = dialled.transport.lost_reason
+        if lost:  # while the connection before ended: it says nothing of MQTT
+            self._tell_server(self._settings.servers[dialled.position])
+            return self._failed(lost)
         channel, ending = await self._serve(dialled)
         return 0.0 if self._next is not None else self._after(channel, ending)
 
@@ -252,6 +287,7 @@ class Line:
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
         finally:
             work.cancel()
+            await asyncio.wait({work}, timeout=CANCEL_TIMEOUT)
         if self._next is None:
             self._backoff.stayed(self._loop.time())
             return
@@ -279,7 +315,7 @@ class Line:
     def on_opened(self, channel: Channel) -> None:
         """CONNACK has come."""
         self._backoff.connected(self._loop.time())
-        self._versions.accepted(self._backoff.server, channel.version)
+        self._versions.answered(self._backoff.server, channel.version)
         self.connections += 1
         self.problem = None
         log.info("%s: connected to %s as %s", self, self.server, quote(channel.client_id))
@@ -299,10 +335,9 @@ class Line:
         server = self._backoff.server
         if ending.refuses_version and channel.version == V5:
             return self._fall_back(server)
-        if ending.is_close and ending.is_new:
-            can_fall_back = channel.version != V5 or not self._settings.overlapping()
-            if can_fall_back and self._versions.closed(server, channel.version):
-                return self._report_problem(f"{ending.text}; trying MQTT 3.1.1", 0.0)
+        if ending.is_new and self._tries_old_version(channel, ending):
+            log.info("%s: %s: %s; trying MQTT 3.1.1", self, self.server, ending.text)
+            return 0.0
         if ending.by is EndedBy.US and ending.code < 0x80:
             return 0.0
         now = self._loop.time()
@@ -335,6 +370,30 @@ class Line:
                 )
         return self._report_problem(text, wait)
 
+    def _tries_old_version(self, channel: Channel, ending: Ending) -> bool:
+        """The connection has ended before or by CONNACK; whether to dial with 3.1.1 at once."""
+        server, version = self._backoff.server, channel.version
+        if ending.refused and not ending.refuses_version:
+            self._versions.answered(server, version)
+        elif not ending.is_close or self._needs_5():
+            self._versions.failed(server)
+        else:
+            return self._versions.closed(server, version)
+        return False
+
+    def _needs_5(self) -> str:
+        """Why the link cannot go on with 3.1.1; empty if it can."""
+        if self._settings.login.method is not None:
+            return "login.method needs it"
+        overlapping = self._settings.overlapping()
+        if not overlapping:
+            return ""
+        out, inward = overlapping[0]
+        return (
+            f"with 3.1.1 the rules for {quote(out.local_filter)} and "
+            f"{quote(inward.remote_filter)} would send messages in a circle"
+        )
+
     def _leave_out(self, asked: list[str]) -> None:
         """The broker has closed the connection upon SUBSCRIBE, perhaps again and again."""
         found = self._unanswered.closed(asked, self._loop.time())
@@ -353,14 +412,9 @@ class Line:
 
     def _fall_back(self, server: int) -> float:
         """The broker does not know MQTT 5."""
-        overlapping = self._settings.overlapping()
-        if overlapping:
-            out, inward = overlapping[0]
-            return self._failed(
-                "the broker does not know MQTT 5, and with 3.1.1 the rules for "
-                f"{quote(out.local_filter)} and {quote(inward.remote_filter)} would send messages "
-                "in a circle"
-            )
+        why = self._needs_5()
+        if why:
+            return self._failed(f"the broker does not know MQTT 5, and {why}")
         self._versions.refused(server)
         log.info("%s: %s does not know MQTT 5, going on with 3.1.1", self, self.server)
         return 0.0

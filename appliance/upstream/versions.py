@@ -16,7 +16,7 @@ class ServerVersions:
     A server that says so in CONNACK is believed for good. Some old ones close the connection
     without a word; but so do proxies whose broker is down, and many others. Therefore, when that
     has happened twice in a row, one connection is tried with 3.1.1, at once, so that little else
-    can have changed in between. If it is accepted, that holds for this connection: the next one
+    can have changed in between. If it is answered, that holds for this connection: the next one
     begins with MQTT 5 again, and needs to be closed once to go on with 3.1.1.
     """
 
@@ -38,13 +38,22 @@ class ServerVersions:
     def closed(self, server: int, version: int) -> bool:
         """The server has closed the connection without CONNACK; whether to try 3.1.1 at once."""
         if version != V5:
-            self._closed.pop(server, None)  # that was not the reason
+            self.failed(server)
             return False
         self._closed[server] = self._closed.get(server, 0) + 1
         return self._closed[server] >= CLOSED_ON
 
-    def accepted(self, server: int, version: int) -> None:
-        """The server has accepted a connection."""
+    def failed(self, server: int) -> None:
+        """The dial failed, or the connection ended in another way, before the server said anything.
+
+        If that was the one connection with 3.1.1, it has shown nothing, and the next one is of
+        MQTT 5 again.
+        """
+        if self._closed.get(server, 0) >= CLOSED_ON:
+            del self._closed[server]
+
+    def answered(self, server: int, version: int) -> None:
+        """The server has answered CONNECT: it knows this version, even if it refuses the login."""
         if version == V5:
             self._closed.pop(server, None)
         elif server in self._closed:

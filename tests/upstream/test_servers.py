@@ -112,6 +112,30 @@ async def test_a_first_server_that_accepts_no_connection_is_left_again(tmp_path:
         await until(lambda: rig.status().connected)
 
 
+async def test_a_connection_to_the_first_server_that_ends_unused_says_nothing_of_mqtt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a server that closes idle connections, while the link waits for acknowledgements."""
+    monkeypatch.setattr(line, "LEAVING", 0.5)
+    async with on_the_second(tmp_path) as (first, second, rig):
+        second.acknowledge = never
+        peer = await rig.client("publisher")
+        await peer.send(Publish("r2d2/events/door", b"1", 1, packet_id=1))
+        await peer.receive()
+        await until(lambda: payloads(second, DOOR))
+
+        def close_idle(visit: Visit) -> None:
+            if len(first.visits) <= 2:
+                visit.close()
+
+        first.accept = close_idle
+        await first.start()
+        await until(lambda: rig.status().connected and first.connects)
+        assert {each.version for each in first.connects} == {V5}
+        assert any(visit.connect is None for visit in first.visits)
+        peer.hang_up()
+
+
 @pytest.mark.patches
 async def test_a_fault_in_the_dial_beside_a_connection_leaves_the_connection_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, escaped: list[str]
@@ -162,6 +186,47 @@ async def test_closes_for_other_reasons_do_not_end_in_3_1_1(tmp_path: Path) -> N
             await fleet.visited()
             await until(lambda: rig.status().connected)
             assert [each.version for each in fleet.connects] == [V5, V5, V311, V5]
+
+
+@pytest.mark.parametrize("end", ["refuses", "resets"])
+async def test_a_try_of_3_1_1_that_fails_is_not_for_ever(tmp_path: Path, end: str) -> None:
+    async with FakeFleet(versions=(V5,)) as fleet:
+        fleet.refuses_version = "3.1.1"
+        ends = 0
+
+        def greet(visit: Visit) -> None:
+            if len(fleet.connects) <= 2:
+                visit.close()
+            else:
+                fleet.good_greeting(visit)
+
+        def reset(visit: Visit) -> None:
+            nonlocal ends
+            if len(fleet.visits) == 3:
+                ends += 1
+                visit.reset()
+
+        fleet.greet = greet
+        if end == "resets":
+            fleet.accept = reset
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await fleet.visited()
+            await until(lambda: rig.status().connected)
+            assert len(fleet.visits) == 4 and rig.status().version == "5"
+            assert ends == (end == "resets")
+
+
+async def test_a_login_that_needs_mqtt_5_is_not_tried_with_3_1_1(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text("secret")
+    (tmp_path / "token").chmod(0o600)
+    login = {"token_file": str(tmp_path / "token"), "method": "OAUTH2-JWT"}
+    async with FakeFleet() as fleet:
+        fleet.greet = closing
+        async with running(Rig(tmp_path, fleet.port, login=login)) as rig:
+            await until(lambda: len(fleet.connects) > 5)
+            assert {each.version for each in fleet.connects} == {V5}
+            fleet.versions = ()
+            await until(lambda: "login.method needs it" in (rig.status().problem or ""))
 
 
 async def test_rules_that_need_mqtt_5_are_not_tried_with_3_1_1(tmp_path: Path) -> None:
