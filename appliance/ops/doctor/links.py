@@ -27,7 +27,7 @@ from appliance.upstream.rules import UpstreamSettings
 from appliance.upstream.settings import upstreams
 from appliance.upstream.transport import Surroundings
 
-#: Seconds for each step of a dial, and for all servers together, which are dialled at once.
+#: Seconds for each step of a dial, and for all of it; all servers are dialled at once.
 STEP_TIMEOUT: Final = 5.0
 TIMEOUT: Final = 20.0
 
@@ -93,21 +93,11 @@ async def _dial_all(
     found: list[UpstreamSettings],
 ) -> dict[tuple[str, ServerUrl], _Outcome | DialError]:
     """The outcome for each server of each link."""
-    dials = {
-        (link.name, server): asyncio.ensure_future(_dial(link, server))
-        for link in found
-        for server in link.servers
-    }
-    _, late = await asyncio.wait(dials.values(), timeout=TIMEOUT)
-    for task in late:
-        task.cancel()
-    if late:
-        await asyncio.wait(late, timeout=1.0)
+    dialled = [(link, server) for link in found for server in link.servers]
+    outcomes = await asyncio.gather(*(_dial(link, server) for link, server in dialled))
     return {
-        key: DialError("connection", f"it has not answered within {TIMEOUT:g} s")
-        if task in late or task.cancelled()
-        else task.result()
-        for key, task in dials.items()
+        (link.name, server): outcome
+        for (link, server), outcome in zip(dialled, outcomes, strict=True)
     }
 
 
@@ -116,9 +106,13 @@ async def _dial(link: UpstreamSettings, server: ServerUrl) -> _Outcome | DialErr
     began = time.monotonic()
     try:
         proxy = None if link.proxy is None else parse_proxy(link.proxy)
-        transport = await dial(server, dialled_tls(link, server), proxy, around, STEP_TIMEOUT)
+        tls = dialled_tls(link, server)
+        dialling = dial(server, tls, proxy, around, STEP_TIMEOUT)
+        transport = await asyncio.wait_for(dialling, TIMEOUT)
     except DialError as error:
         return error
+    except asyncio.TimeoutError:
+        return DialError("connection", f"it has not answered within {TIMEOUT:g} s")
     except (OSError, RuntimeError, ValueError) as error:
         return DialError("connection", str(error))
     seconds = time.monotonic() - began
