@@ -61,7 +61,10 @@ class ChannelOwner(Protocol):
         """The broker has accepted the connection."""
 
     def subscribed(self, channel: Channel, results: list[tuple[Subscription, int]]) -> None:
-        """The broker has answered all subscriptions; those that it refuses, with the reason."""
+        """The broker has answered all subscriptions; those that it refuses, with the reason.
+
+        Called again when it has answered those of `Channel.subscribe`.
+        """
 
     def acknowledged(self, entries: list[Entry | None], code: int, reason: str) -> None:
         """Messages that were sent on the channel are acknowledged, or refused (0x80 and above)."""
@@ -104,8 +107,10 @@ class Channel:
         self._loop = owner.entries.loop
         self._unasked = deque(subscriptions)
         self._one_by_one = one_by_one
-        #: The topic filters that the broker was asked for last.
-        self.asked: list[str] = []
+        #: The topic filters that the broker was asked for and has not answered yet, and those that
+        #: it has answered.
+        self.unanswered: list[str] = []
+        self.answered: list[str] = []
         self._refused: list[tuple[Subscription, int]] = []
         self._transport: UpstreamTransport | None = None
         self._ping_interval = math.inf if late is None else max(late / 2, SHORTEST_PING)
@@ -120,7 +125,7 @@ class Channel:
         self._has_ended = False
         #: Why the connection ends as soon as nothing is under way; empty while it stays.
         self._leaving = ""
-        #: The broker has answered all subscriptions.
+        #: The broker has answered all subscriptions that it was asked for first.
         self.is_subscribed = False
 
     def __str__(self) -> str:
@@ -212,6 +217,8 @@ class Channel:
         elif isinstance(event, Subscribed):
             self._refused += [each for each in event.results if each[1] >= 0x80]
             if event.complete:
+                self.answered += self.unanswered
+                self.unanswered = []
                 self._subscribe_on()
         elif isinstance(event, Challenged):
             self.connection.close(
@@ -230,13 +237,22 @@ class Channel:
         while self._unasked:
             count = 1 if self._one_by_one else len(self._unasked)
             some = [self._unasked.popleft() for _ in range(count)]
-            self.asked = [each.filter for each in some]
             refused = self.connection.subscribe(some)
             self._refused += refused
             if len(refused) < count:
+                self.unanswered = [each.filter for each in some]
                 return  # the answers come
+        refused, self._refused = self._refused, []
+        self._owner.subscribed(self, refused)
         self.is_subscribed = True
-        self._owner.subscribed(self, self._refused)
+
+    def subscribe(self, subscriptions: Sequence[Subscription]) -> None:
+        """Ask for more, one by one, on a connection that `is_subscribed`; not while one is under
+        way."""
+        self._unasked.extend(subscriptions)
+        self._one_by_one = True
+        self._subscribe_on()
+        self.write(self._loop.time())
 
     def _after(self, now: float) -> None:
         """At the end of a round: commit, send on, write, and look at the times again."""

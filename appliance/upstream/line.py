@@ -103,13 +103,13 @@ class Line:
         self.attempts = 0
         self.connections = 0
         self.refused_filters: list[str] = []
-        #: The filters that the present connection does not ask for, see `UnansweredFilters`.
-        self.left_out: list[str] = []
+        #: What the present connection has not asked for yet, by filter: see `UnansweredFilters`.
+        self._missing: dict[str, Subscription] = {}
         self._link = link
         self._settings = link.settings
         self._loop = link.entries.loop
         self._versions = ServerVersions(link.settings.version)
-        self._unanswered = UnansweredFilters()
+        self._unanswered = [UnansweredFilters() for _ in link.settings.servers]
         self._backoff = Backoff(len(link.settings.servers), random.random)
         self._ending: asyncio.Future[Ending] | None = None
         self._task: asyncio.Task[None] | None = None
@@ -214,19 +214,18 @@ class Line:
         link = self._link
         self._tell_server(self._settings.servers[dialled.position])
         version = self._versions.of(dialled.position)
-        self.left_out = self._unanswered.left_out(self._loop.time())
-        subscriptions = [
-            each
-            for each in link.subscriptions(version, is_kept=self.is_kept)
-            if each.filter not in self.left_out
-        ]
+        unanswered = self._unanswered[dialled.position]
+        self._missing = {
+            each.filter: each for each in link.subscriptions(version, is_kept=self.is_kept)
+        }
+        subscriptions = [self._missing.pop(each) for each in unanswered.ask(list(self._missing))]
         channel = Channel(
             link,
             link.connect_settings(version, dialled.credentials, is_kept=self.is_kept),
             subscriptions,
             link.least_late(is_kept=self.is_kept),
             is_kept=self.is_kept,
-            one_by_one=self._unanswered.one_by_one,
+            one_by_one=unanswered.one_by_one,
         )
         self.channel = channel
         ended = self._ending = self._loop.create_future()
@@ -350,9 +349,9 @@ class Line:
             advice = ending_advice(
                 ending, self._settings, self._settings.servers[server], self._client_id
             )
-            if ending.is_close and not ending.is_new and not channel.is_subscribed:
-                advice = unanswered_filters(channel.asked)
-                self._leave_out(channel.asked)
+            if ending.is_close and channel.unanswered:
+                advice = unanswered_filters(channel.unanswered)
+                self._leave_out(channel)
             return self._failed(f"{ending.text}; {advice}" if advice else ending.text)
         text = ending.text
         if self._backoff.is_contested(now):
@@ -394,9 +393,14 @@ class Line:
             f"{quote(inward.remote_filter)} would send messages in a circle"
         )
 
-    def _leave_out(self, asked: list[str]) -> None:
+    def _leave_out(self, channel: Channel) -> None:
         """The broker has closed the connection upon SUBSCRIBE, perhaps again and again."""
-        found = self._unanswered.closed(asked, self._loop.time())
+        found = self._unanswered[self._backoff.server].closed(
+            channel.unanswered,
+            self._loop.time(),
+            channel.answered,
+            lived=channel.is_subscribed,
+        )
         if found is not None:
             log.warning(
                 "%s: the fleet's broker closes the connection upon the subscription to %s: %s",
@@ -405,10 +409,27 @@ class Line:
                 subscription_advice(ReasonCode.NOT_AUTHORIZED, self._settings, found),
             )
 
-    def on_subscribed(self, refused: list[str]) -> None:
+    def on_subscribed(self, channel: Channel, refused: list[str]) -> None:
         """The broker has answered all subscriptions, and refused these."""
-        self._unanswered.answered()
-        self.refused_filters = refused + self.left_out
+        self._unanswered[self._backoff.server].answered(channel.answered)
+        self.refused_filters = (self.refused_filters if channel.is_subscribed else []) + refused
+
+    @property
+    def missing_filters(self) -> list[str]:
+        """The filters that the present connection does not subscribe to, as the broker has closed
+        it upon them before."""
+        return [] if self.channel is None else list(self._missing)
+
+    def tick(self) -> None:
+        """Called every second: ask for what the connection has not asked for, once that is due."""
+        channel = self.channel
+        if channel is None or not channel.is_subscribed or channel.unanswered:
+            return
+        now = self._loop.time()
+        unanswered = self._unanswered[self._backoff.server]
+        due = unanswered.due(self._missing, now - channel.connected_at, now)
+        if due:
+            channel.subscribe([self._missing.pop(each) for each in due])
 
     def _fall_back(self, server: int) -> float:
         """The broker does not know MQTT 5."""

@@ -14,7 +14,8 @@ class LinkStatus:
     `problem` is why it is not connected, or what is wrong although it is. `waiting` messages are
     not acknowledged by the fleet's broker yet; the oldest is `oldest` seconds old. `dropped` is by
     rule and reason, both ways. Of what came, `held_back` messages wait for their receivers here,
-    and `unacknowledged` ones are not acknowledged to the fleet's broker.
+    and `unacknowledged` ones are not acknowledged to the fleet's broker. `refused_filters` are of
+    subscriptions that it refuses, `missing_filters` of those upon which it closes the connection.
     """
 
     name: str
@@ -46,6 +47,7 @@ class LinkStatus:
     set_aside: int = 0
     too_large: int = 0
     refused_filters: list[str] = field(default_factory=list)
+    missing_filters: list[str] = field(default_factory=list)
     denied: dict[str, str] = field(default_factory=dict)
     advice: str | None = None
 
@@ -64,6 +66,11 @@ def warnings_of(status: dict[str, Any]) -> Iterator[str]:
         yield f"the access rules do not let it read {name}: {reason}"
     for name in status["refused_filters"]:
         yield f"the fleet's broker refuses the subscription to {name}"
+    for name in status["missing_filters"]:
+        yield (
+            f"the link has not subscribed to {name}: the fleet's broker has closed the connection "
+            "upon that; it is tried again later"
+        )
     if status["too_large"]:
         yield (
             "messages that are larger than the fleet's broker takes now (Maximum Packet Size) wait "

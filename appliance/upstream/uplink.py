@@ -157,6 +157,8 @@ class Uplink:
     def _tick(self) -> None:
         self._backlog.tick(self._journal_clock())
         counts = self._backlog.counts()
+        for line in self._lines:
+            line.tick()
         now = self._loop.time()
         self._offered.tick(now, counts.offered)
         self._sent.tick(now, counts.sent)
@@ -271,7 +273,7 @@ class Uplink:
     def subscribed(self, channel: Channel, refused: list[tuple[Subscription, int]]) -> None:
         """See `ChannelOwner`."""
         line = self._line_of(channel)
-        line.on_subscribed([each.filter for each, _ in refused])
+        line.on_subscribed(channel, [each.filter for each, _ in refused])
         for each, code in refused:
             log.warning(
                 "%s: the fleet's broker refuses the subscription to %s: %s; %s",
@@ -280,18 +282,20 @@ class Uplink:
                 reason_words(code),
                 subscription_advice(code, self.settings, each.filter),
             )
-        if not line.is_kept:
+        if not line.is_kept and not channel.is_subscribed:
             self._state_due = True  # as soon as the window has room
         self._report()
 
     def ended(self, channel: Channel, ending: Ending) -> None:
         """See `ChannelOwner`."""
         line = self._line_of(channel)
-        is_causeless = ending.is_close and channel.is_subscribed
+        is_answered = channel.is_subscribed and not channel.unanswered
+        is_causeless = ending.is_close and is_answered
         try:
             if not line.is_kept:
                 inflight = channel.connection.unsettled()
-                is_stuck = self._sender.end(ending, inflight, was_settled=self._is_settled)
+                was_settled = self._is_settled and is_answered
+                is_stuck = self._sender.end(ending, inflight, was_settled=was_settled)
                 is_causeless = is_causeless and self._is_settled and not is_stuck
         finally:
             line.on_ended(ending, is_causeless=is_causeless)
@@ -420,6 +424,7 @@ class Uplink:
             status.dropped.setdefault(rule, {})[verdict.value] = count
         status.set_aside, status.too_large = counts.aside, counts.held
         status.refused_filters = [each for line in self._lines for each in line.refused_filters]
+        status.missing_filters = [each for line in self._lines for each in line.missing_filters]
         status.denied = dict(self._out.denied)
         status.advice = bottleneck(status)
         return status

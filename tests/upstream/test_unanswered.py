@@ -2,31 +2,161 @@
 
 from __future__ import annotations
 
-from appliance.upstream.unanswered import LEFT_OUT_FOR, UnansweredFilters
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from waiting import until
+
+from appliance.mqtt.packets import Subscribe
+from appliance.upstream import unanswered as unanswered_module
+from appliance.upstream import uplink
+from appliance.upstream.status import warnings_of
+from appliance.upstream.unanswered import (
+    LEFT_OUT_FOR,
+    LIVED,
+    LONGEST_LEFT_OUT,
+    UnansweredFilters,
+)
+from upstream.fake_fleet import FakeFleet, Visit
+from upstream.uplink_rig import Rig, hurry, running
+from upstream.uplink_rig import event_loop_policy as event_loop_policy
+
+pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 
-def test_the_filter_that_ends_the_connection_is_found_and_left_out_for_an_hour():
-    unanswered = UnansweredFilters()
-    filters = ["a", "bad", "c", "worse"]
-    ends = 0
-    while True:
-        left = [each for each in filters if each not in unanswered.left_out(0)]
-        rounds = [[each] for each in left] if unanswered.one_by_one else [left]
-        asked = next((each for each in rounds if {"bad", "worse"} & set(each)), None)
-        if asked is None:
-            break
-        ends += 1
-        unanswered.closed(asked, 0)
-    unanswered.answered()
-    assert unanswered.left_out(LEFT_OUT_FOR - 1) == ["bad", "worse"] and ends == 10
-    assert not unanswered.one_by_one
-    assert unanswered.left_out(LEFT_OUT_FOR) == []
+class Connections:
+    """Connections to a broker that closes at some filters."""
+
+    def __init__(self, *filters: str) -> None:
+        self.unanswered = UnansweredFilters()
+        self.filters = filters
+        self.closes = 0
+
+    def connect(self, closes_at: Callable[[str], bool], now: float = 0.0) -> set[str] | None:
+        """One that lives for long if it is not closed; what is subscribed to, None if closed."""
+        one_by_one = self.unanswered.one_by_one
+        asked = self.unanswered.ask(self.filters)
+        answered: list[str] = []
+        for batch in [[each] for each in asked] if one_by_one else [asked] if asked else []:
+            if any(map(closes_at, batch)):
+                return self.close(batch, now, answered, lived=False)
+            answered += batch
+        self.unanswered.answered(answered)
+        missing = [each for each in self.filters if each not in answered]
+        for each in self.unanswered.due(missing, LIVED, now):
+            if closes_at(each):
+                return self.close([each], now, answered, lived=True)
+            answered.append(each)
+            self.unanswered.answered(answered)
+        return set(answered)
+
+    def close(self, filters: list[str], now: float, answered: list[str], *, lived: bool) -> None:
+        self.closes += 1
+        self.unanswered.closed(filters, now, answered, lived=lived)
 
 
-def test_ends_with_an_answer_between_are_of_another_reason():
-    unanswered = UnansweredFilters()
-    for _ in range(3):
-        assert unanswered.closed(["a"], 0) is None and unanswered.closed(["a"], 0) is None
-        assert unanswered.one_by_one
-        unanswered.answered()
-    assert not unanswered.one_by_one and unanswered.left_out(0) == []
+@pytest.mark.parametrize("bad", [{"a"}, {"c"}, {"b", "d"}, {"a", "b", "c"}, {"a", "b", "c", "d"}])
+def test_filters_that_end_the_connection_are_found_and_others_are_not_left_out(
+    bad: set[str],
+) -> None:
+    link = Connections("a", "b", "c", "d")
+    while link.connect(lambda each: each in bad) is None:
+        assert link.closes < 20
+    assert link.connect(lambda each: each in bad) == set("abcd") - bad
+    # Their time is over, and they are allowed now.
+    assert link.connect(lambda each: False, LEFT_OUT_FOR - 1) == set("abcd") - bad
+    assert link.connect(lambda each: False, LEFT_OUT_FOR) == set("abcd")
+    assert not link.unanswered.one_by_one
+
+
+def test_a_filter_that_is_alone_is_left_out_as_well_but_not_for_one_close() -> None:
+    link = Connections("a")
+    assert link.connect(lambda each: True) is None
+    assert link.connect(lambda each: False) == {"a"}  # asked for at once
+    while link.connect(lambda each: True) is None:
+        assert link.closes < 7
+    assert link.connect(lambda each: True) == set()
+
+
+@pytest.mark.parametrize("closes", range(1, 12))
+def test_closes_for_another_reason_leave_nothing_out(closes: int) -> None:
+    """As of a broker that is starting: upon whatever it is asked first."""
+    link = Connections("a", "b", "c")
+    for _ in range(closes):
+        for each in link.unanswered.ask(link.filters)[:1]:
+            link.close([each], 0, [], lived=False)
+    assert link.connect(lambda each: False) == {"a", "b", "c"}
+    assert not link.unanswered.one_by_one
+
+
+def test_a_filter_is_left_out_for_longer_each_time() -> None:
+    link = Connections("a", "b")
+    now = 0.0
+    times = []
+    while len(times) < 7:
+        closes = link.closes
+        if link.connect(lambda each: each == "a", now) is not None:
+            before = now
+            while not link.unanswered.due(["a"], LIVED, now):
+                now += LEFT_OUT_FOR / 4
+            times.append((now - before) / LEFT_OUT_FOR)
+            assert link.closes == closes
+    assert times == [1, 2, 4, 8, 16, 24, LONGEST_LEFT_OUT / LEFT_OUT_FOR]
+
+
+async def test_a_link_works_without_a_filter_and_asks_for_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hurry(monkeypatch)
+    monkeypatch.setattr(uplink, "TICK", 0.05)
+    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 1.0)
+    command, secret = "fleet/r2d2/cmd/#", "fleet/r2d2/secret/#"
+    rules = [{"topic": "secret/#"}, {"topic": "cmd/#"}]
+    async with FakeFleet() as fleet:
+        is_allowed = False
+
+        def grant(visit: Visit, packet: Subscribe) -> None:
+            if secret in (each.filter for each in packet.subscriptions) and not is_allowed:
+                visit.close()
+            else:
+                fleet.good_grant(visit, packet)
+
+        fleet.grant = grant
+        async with running(Rig(tmp_path, fleet.port, **{"in": rules})) as rig:
+            await until(lambda: rig.status().missing_filters == [secret])
+            await until(lambda: rig.status().connected and command in fleet.visit.filters)
+            visit = fleet.visit
+            assert secret not in visit.filters and rig.status().problem is None
+            (told,) = warnings_of(rig.status().as_json())
+            assert secret in told
+            is_allowed = True
+            await until(lambda: not rig.status().missing_filters)
+            await until(lambda: secret in visit.filters)
+            await rig.drained()
+            assert fleet.visit is visit and rig.status().connected
+            states = [each.payload for each in visit.published if "state" in each.topic]
+            assert states == [b"online"]  # not said again
+            assert not list(warnings_of(rig.status().as_json()))
+
+
+async def test_closes_between_connack_and_suback_leave_no_command_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hurry(monkeypatch)
+    monkeypatch.setattr(uplink, "TICK", 0.05)
+    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    async with FakeFleet() as fleet:
+
+        def grant(visit: Visit, packet: Subscribe) -> None:
+            if len(fleet.visits) <= 5:
+                visit.close()
+            else:
+                fleet.good_grant(visit, packet)
+
+        fleet.grant = grant
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            both = {"fleet/r2d2/cmd/#", "fleet/r2d2/_answers/+"}
+            await until(lambda: len(fleet.visits) > 5 and set(fleet.visit.filters) == both)
+            await until(lambda: rig.status().connected and not rig.status().missing_filters)
