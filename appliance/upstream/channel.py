@@ -282,7 +282,9 @@ class Channel:
         if self._timer is not None and now < self._checked_at + CHECKED_FOR:
             return
         self._checked_at = now
-        due = self.connection.tick(now, self._transport.unsent)
+        due = self.connection.tick(
+            now, self._transport.unsent, is_reading="receivers" not in self._holds
+        )
         if self.connection.ended is not None:
             self._finish()
             return

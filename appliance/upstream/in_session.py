@@ -142,11 +142,12 @@ class InSession:
         answering: Session,
         connection: InConnection,
         counters: InCounters,
+        readiness: Readiness,
         *,
         is_kept: bool = False,
     ) -> None:
-        """`answering` is `OutSession.answering`. `is_kept`: the session there outlives its
-        connections."""
+        """`answering` is `OutSession.answering`, `readiness` the link's. `is_kept`: the session
+        there outlives its connections."""
         self._broker = broker
         self._settings = settings
         self._rules = rules
@@ -171,7 +172,7 @@ class InSession:
         #: Since when the first one waits for decisions; None when it does not.
         self._undecided_since: float | None = None
         self._allowance = PublisherAllowance()
-        self._readiness = Readiness()
+        self._readiness = readiness
 
     def __str__(self) -> str:
         return str(self._session)

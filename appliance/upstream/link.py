@@ -177,9 +177,10 @@ class FleetConnection(Generic[T]):
         self._taken = 0
         self._left = 0
         # Times: of the last bytes sent and received, of progress on the network, of the last late
-        # tick, of the last tick at which the oldest packet without an answer had not left.
+        # tick, of the last tick at which the oldest packet without an answer had not left, and of
+        # the last one at which the owner was not reading.
         self._sent_at = self._received_at = self._left_at = -math.inf
-        self._held_up_at = self._blocked_at = -math.inf
+        self._held_up_at = self._blocked_at = self._unread_at = -math.inf
         self._due = math.inf
 
     def __str__(self) -> str:
@@ -423,16 +424,19 @@ class FleetConnection(Generic[T]):
             self._fail(error.code, str(error))
         return events
 
-    def tick(self, now: float, unsent: int = 0) -> float:
+    def tick(self, now: float, unsent: int = 0, *, is_reading: bool = True) -> float:
         """Send a PINGREQ if one is due, or end a connection that is silent; when it is due next.
 
-        `unsent` are the taken bytes that the network has not taken yet. It is also to be called
-        after a `take` that returned something: what was sent has deadlines of its own.
+        `unsent` are the taken bytes that the network has not taken yet. While the owner is not
+        reading, for reasons of its own, no answer of the broker's is missed. It is also to be
+        called after a `take` that returned something: what was sent has deadlines of its own.
         """
         if self.ended is not None or not (self._taken or self._out):
             return math.inf
         if now > self._due + LATE_TICK:
             self._held_up_at = now
+        if not is_reading:
+            self._unread_at = now
         left = self._taken - unsent
         if left != self._left or not unsent:
             self._left, self._left_at = left, now
@@ -475,7 +479,7 @@ class FleetConnection(Generic[T]):
         if waiting.end > self._left:
             self._blocked_at = now
             return now
-        return max(waiting.at, self._blocked_at, self._held_up_at)
+        return max(waiting.at, self._blocked_at, self._held_up_at, self._unread_at)
 
     def _keep_alive(self, now: float) -> float:
         """Send a PINGREQ if one is due, or end a silent connection; when that would be next."""
@@ -496,7 +500,8 @@ class FleetConnection(Generic[T]):
             return due
         answered = max(self._since(self._pings[0], now), self._received_at)
         deadline = answered + interval * ANSWER_WITHIN
-        if deadline <= now or len(self._pings) >= MAXIMUM_PINGS:
+        is_full = len(self._pings) >= MAXIMUM_PINGS and self._unread_at < now
+        if deadline <= now or is_full:
             self._give_up(f"no PINGRESP, and silent for {now - self._received_at:.1f} s")
         return min(due, deadline)
 

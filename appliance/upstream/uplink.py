@@ -33,6 +33,7 @@ from appliance.upstream.limits import KINDS
 from appliance.upstream.line import AGAIN, Line
 from appliance.upstream.out_session import OutSession
 from appliance.upstream.presence import Presence, presence_messages
+from appliance.upstream.readiness import Readiness
 from appliance.upstream.refusals import (
     reason_words,
     state_advice,
@@ -107,6 +108,7 @@ class Uplink:
             self._offer_later,
         )
         self._in_counters = InCounters()
+        self._readiness = Readiness()
         self._lines = [Line(self, is_kept=False)]
         if any(rule.offline == "keep" for rule in settings.inward):
             self._lines.append(Line(self, is_kept=True))
@@ -254,6 +256,7 @@ class Uplink:
             answering,
             channel,
             self._in_counters,
+            self._readiness,
             is_kept=self._line_of(channel).is_kept,
         )
 

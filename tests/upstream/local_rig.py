@@ -26,6 +26,7 @@ from appliance.upstream.in_session import InCounters, InSession
 from appliance.upstream.late import Freshness
 from appliance.upstream.link_events import Arrived
 from appliance.upstream.out_session import OutSession
+from appliance.upstream.readiness import Readiness
 from appliance.upstream.rules import LinkRules, OutRule
 
 from .links import link
@@ -227,6 +228,7 @@ class Fleet:
             answering,
             self.connection,
             rig.counters,
+            Readiness(),
             **options,
         )
         self._packet_id = 0
