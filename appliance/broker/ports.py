@@ -418,6 +418,31 @@ class LatestRecords(Protocol):
         """Remove the record, within a second; a key that is not there is ignored."""
 
 
+class SingleRecords(Protocol):
+    """Records that are read one by one, in the transactions of the store. Only keys are in memory.
+
+    What they are is to be stored elsewhere, such as in `LatestRecords`.
+    """
+
+    def load(self) -> list[int]:
+        """The keys of all records, in their order."""
+
+    def put(self, record: bytes, *, awaited: bool = True) -> int:
+        """Stage a record; returns its key, a new one.
+
+        When `awaited` is False, no packet waits for its commit.
+        """
+
+    def remove(self, key: int) -> None:
+        """Remove the record, within a second; a key that is not there is ignored."""
+
+    def read(self, key: int, callback: RecordsRead) -> None:
+        """Pass the record, as the only one, to the callback in a later round of the event loop.
+
+        Outcomes are those of `Journal.read`.
+        """
+
+
 class Backlogs(Protocol):
     """The records of the links to other brokers, by the links' names, beside what clients store.
 
@@ -433,6 +458,9 @@ class Backlogs(Protocol):
 
     def latest(self, link: str) -> LatestRecords:
         """The latest records of the link's topics; the same object each time."""
+
+    def single(self, link: str) -> SingleRecords:
+        """Records of the link that are read one by one; the same object each time."""
 
     def aside(self, link: str) -> LatestRecords:
         """The records that the link has set aside; the same object each time."""

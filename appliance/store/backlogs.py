@@ -9,7 +9,8 @@ from appliance.store.journal import StoredJournal
 from appliance.store.link_backlogs import LinkBacklogs
 from appliance.store.loader import LoadedBacklogs
 from appliance.store.reader import Reader
-from appliance.store.rows import Table
+from appliance.store.rows import SINGLE_LANE, Table
+from appliance.store.single_records import StoredSingleRecords
 
 
 class StoredLatestRecords:
@@ -47,7 +48,7 @@ class StoredLatestRecords:
             self._committer.stage_lazily()
 
 
-class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords]):
+class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords, StoredSingleRecords]):
     """`Backlogs` in the database of the committer."""
 
     def __init__(self, committer: Committer, clock: StoreClock) -> None:
@@ -63,7 +64,10 @@ class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords]):
         self._committer.after_commit = self._committed
         self._loaded = loaded
         for link, lane in loaded.segments:
-            self.journal(link, lane)
+            if lane == SINGLE_LANE:
+                self.single(link)
+            else:
+                self.journal(link, lane)
         for link, kind in loaded.records:
             self.records(link, kind)
 
@@ -75,6 +79,8 @@ class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords]):
     def _committed(self, number: int) -> None:
         for journal in self._journals.values():
             journal.committed(number)
+        for single in self._single.values():
+            single.committed(number)
 
     @property
     def failing(self) -> bool:
@@ -85,6 +91,11 @@ class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords]):
         assert self._reader is not None, "not before `restore`"
         segments = self._loaded.segments.get((link, lane), [])
         return StoredJournal(link, lane, segments, self._committer, self._reader, self._clock)
+
+    def _make_single(self, link: str) -> StoredSingleRecords:
+        assert self._reader is not None, "not before `restore`"
+        segments = self._loaded.segments.get((link, SINGLE_LANE), [])
+        return StoredSingleRecords(link, segments, self._committer, self._reader, self._clock)
 
     def _make_records(self, link: str, kind: int) -> StoredLatestRecords:
         records = self._loaded.records.get((link, kind), {})

@@ -17,7 +17,15 @@ from appliance.mqtt.topics import check_filter, matches
 from appliance.store import database
 from appliance.store.clock import Clocks, boot_id, stamp_of
 from appliance.store.loader import load
-from appliance.store.rows import OwedRow, ReceivedRow, Rows, SubscriptionRow, Table, Value
+from appliance.store.rows import (
+    SINGLE_LANE,
+    OwedRow,
+    ReceivedRow,
+    Rows,
+    SubscriptionRow,
+    Table,
+    Value,
+)
 from appliance.store.schema import (
     DamagedError,
     StoreError,
@@ -272,7 +280,8 @@ def prune_upstream(path: Path, link: str) -> int:
                 batch.remove(Table.LATEST, key)
         if not batch:
             raise StoreError(f"nothing waits for an upstream {link!r}")
-        waiting = sum(backlog.messages for backlog in found)
+        # What a single record is says a row of the table `latest`.
+        waiting = sum(backlog.messages for backlog in found if backlog.lane != SINGLE_LANE)
         return waiting + len(batch.deleted[Table.LATEST])
 
 

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from appliance.broker.ports import Journal, LatestRecords
+from appliance.broker.ports import Journal, LatestRecords, SingleRecords
 from appliance.store.rows import LATEST, SET_ASIDE
 
 AnyJournal = TypeVar("AnyJournal", bound=Journal)
 AnyRecords = TypeVar("AnyRecords", bound=LatestRecords)
+AnySingle = TypeVar("AnySingle", bound=SingleRecords)
 
 
-class LinkBacklogs(Generic[AnyJournal, AnyRecords]):
+class LinkBacklogs(Generic[AnyJournal, AnyRecords, AnySingle]):
     """The journals and records of all links; each is made when it is first asked for."""
 
     def __init__(self) -> None:
         self._journals: dict[tuple[str, int], AnyJournal] = {}
         self._records: dict[tuple[str, int], AnyRecords] = {}
+        self._single: dict[str, AnySingle] = {}
 
     def _make_journal(self, link: str, lane: int) -> AnyJournal:
         raise NotImplementedError
 
     def _make_records(self, link: str, kind: int) -> AnyRecords:
         """`kind` is LATEST or SET_ASIDE."""
+        raise NotImplementedError
+
+    def _make_single(self, link: str) -> AnySingle:
         raise NotImplementedError
 
     def journal(self, link: str, lane: int) -> AnyJournal:
@@ -43,6 +48,13 @@ class LinkBacklogs(Generic[AnyJournal, AnyRecords]):
         """See `Backlogs`."""
         return self.records(link, LATEST)
 
+    def single(self, link: str) -> AnySingle:
+        """See `Backlogs`."""
+        found = self._single.get(link)
+        if found is None:
+            found = self._single[link] = self._make_single(link)
+        return found
+
     def aside(self, link: str) -> AnyRecords:
         """See `Backlogs`."""
         return self.records(link, SET_ASIDE)
@@ -51,6 +63,7 @@ class LinkBacklogs(Generic[AnyJournal, AnyRecords]):
         """See `Backlogs`."""
         names = {link for (link, _), journal in self._journals.items() if journal.segments()}
         names |= {link for (link, _), records in self._records.items() if records.load()}
+        names |= {link for link, records in self._single.items() if records.load()}
         return sorted(names)
 
     def forget(self, link: str) -> None:
@@ -62,3 +75,6 @@ class LinkBacklogs(Generic[AnyJournal, AnyRecords]):
         for records in (self.latest(link), self.aside(link)):
             for key, _ in records.load():
                 records.remove(key)
+        single = self.single(link)
+        for key in single.load():
+            single.remove(key)

@@ -97,7 +97,36 @@ class MemoryLatestRecords:
         self._records.pop(key, None)
 
 
-class MemoryBacklogs(LinkBacklogs[MemoryJournal, MemoryLatestRecords]):
+class MemorySingleRecords:
+    """`SingleRecords` in memory."""
+
+    def __init__(self, keys: Iterator[int], soon: Soon) -> None:
+        self._keys = keys
+        self._soon = soon
+        self._records: dict[int, bytes] = {}
+
+    def load(self) -> list[int]:
+        """See `SingleRecords`."""
+        return sorted(self._records)
+
+    def put(self, record: bytes, *, awaited: bool = True) -> int:
+        """See `SingleRecords`."""
+        key = next(self._keys)
+        self._records[key] = record
+        return key
+
+    def remove(self, key: int) -> None:
+        """See `SingleRecords`."""
+        self._records.pop(key, None)
+
+    def read(self, key: int, callback: RecordsRead) -> None:
+        """See `SingleRecords`."""
+        record = self._records.get(key)
+        records = [] if record is None else [record]
+        self._soon(lambda: callback(records))
+
+
+class MemoryBacklogs(LinkBacklogs[MemoryJournal, MemoryLatestRecords, MemorySingleRecords]):
     """`Backlogs` in memory; `soon` calls in a later round of the event loop."""
 
     failing = False
@@ -110,6 +139,9 @@ class MemoryBacklogs(LinkBacklogs[MemoryJournal, MemoryLatestRecords]):
 
     def _make_journal(self, link: str, lane: int) -> MemoryJournal:
         return MemoryJournal(self._keys, self._soon, self._now)
+
+    def _make_single(self, link: str) -> MemorySingleRecords:
+        return MemorySingleRecords(self._keys, self._soon)
 
     def _make_records(self, link: str, kind: int) -> MemoryLatestRecords:
         return MemoryLatestRecords(self._keys)

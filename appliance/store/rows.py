@@ -171,6 +171,9 @@ class BacklogRow(NamedTuple):
 #: The kinds of rows in the table `latest`: the latest record of its topic, and one set aside.
 LATEST, SET_ASIDE = 0, 1
 
+#: The lane of segments that are no journal's: a record of a link that is read by itself.
+SINGLE_LANE = 1 << 40
+
 
 class LatestRow(NamedTuple):
     """A record of a link that a newer one may replace; `kind` is LATEST or SET_ASIDE."""

@@ -31,11 +31,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
+from struct import Struct
 from typing import Final
 
 from appliance.broker.ports import Backlogs, RecordsLostError, Segment
+from appliance.upstream.latest_values import LatestValue
 from appliance.upstream.rates import TokenBucket
-from appliance.upstream.records import Record, encode_record, record_times
+from appliance.upstream.records import Record, encode_record, record_head, record_times
 from appliance.upstream.rule_queue import (
     AGAIN,
     ENTRY_OVERHEAD,
@@ -44,6 +46,7 @@ from appliance.upstream.rule_queue import (
     LATER,
     LATEST_OVERHEAD,
     LOADED_OVERHEAD,
+    SINGLE_OVERHEAD,
     Entry,
     HeldSegment,
     RuleQueue,
@@ -63,6 +66,12 @@ IN_FLIGHT_SIZE: Final = 3 * MIB
 LOADED_SIZE: Final = 5 * MIB // 4
 LATEST_SIZE: Final = 3 * MIB
 LIVE_SIZE: Final = 7 * MIB // 2
+
+#: Bytes of the topics of which the latest message is only on disk; with more, the oldest are
+#: dropped. And of such messages that are read, of which each rule may have one in any case.
+TOPICS_SIZE: Final = 32 * MIB
+VALUES_SIZE: Final = 256 * KIB
+VALUES_AT_ONCE: Final = 32
 
 #: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
 #: higher lane would wait for all of them.
@@ -101,6 +110,13 @@ HELD: Final = "\0too large"
 _LATEST: Final = b"L"
 _LATER: Final = b"R"
 _NUMBERS: Final = b"N"
+#: The key and the size of a record that is stored by itself, and its head.
+_SINGLE: Final = b"S"
+_SINGLE_HEADER: Final = Struct(">QI")
+
+#: What is too large for now waits in so many messages at most, and this part of the backlog's size.
+MOST_HELD: Final = 10_000
+HELD_SHARE: Final = 1 / 4
 
 
 class DropReason(Enum):
@@ -165,6 +181,7 @@ class Backlog:
         self._name = name
         self._backlogs = backlogs
         self._latest = backlogs.latest(name)
+        self._single = backlogs.single(name)
         self._wake = wake
         self._limits = limits
         self._bucket: TokenBucket | None = None
@@ -196,6 +213,11 @@ class Backlog:
         self._flying_size = 0
         self._again_size = 0
         self._live_size = 0
+        #: Of topics whose latest message is only on disk, and the bytes of those that are read.
+        self._topics_size = 0
+        self._values_size = 0
+        #: No latest message expires before.
+        self._earliest_end = math.inf
         #: To be tried again: when, number, entry; and how many of them are not GONE.
         self._later: list[tuple[float, int, Entry]] = []
         self._later_count = 0
@@ -204,8 +226,10 @@ class Backlog:
         self._repeated: set[int] = set()
         self._full_since: int | None = None
         self._counts = BacklogCounts()
-        #: The bytes of a packet up to which the held messages are known to be too large.
-        self._held_at = 0
+        #: The bytes of a packet at which all held messages are known to be too large; and at which
+        #: those were that have not been handed out on this connection, which takes more.
+        self._held_at = 0.0
+        self._held_before = math.inf
 
         #: By rule: the number of its journal; and the key of the row that says so.
         self._numbers: dict[str, int] = {}
@@ -231,6 +255,7 @@ class Backlog:
         What waits for a rule that is no more is sent nevertheless.
         """
         self._limits = limits
+        self._earliest_end = 0.0
         self._follow(rules, rate, bytes_per_second, now)
         self._forget_drained()
         self._sort()
@@ -257,6 +282,8 @@ class Backlog:
         if queue is None:
             queue = self._queues[name] = RuleQueue(rule)
         elif not queue.configured:
+            if not queue.mixed and queue.stored:
+                queue.note_restored(self._number)  # their topics were not noted
             queue.use(rule)
         queue.configured = True
         queue.bucket = _bucket(queue.bucket, queue.rule.rate, now)
@@ -299,9 +326,11 @@ class Backlog:
 
     def _restore(self) -> None:
         later: list[tuple[Record, int, int]] = []
+        values: dict[tuple[str, str], LatestValue] = {}
+        single = set(self._single.load())
         for key, row in self._latest.load():
             try:
-                self._restore_row(key, row, later)
+                self._restore_row(key, row, later, values, single)
             except ValueError as error:
                 log.warning("backlog of %s: a row is unreadable: %s", self._name, error)
                 self._latest.remove(key)
@@ -315,6 +344,14 @@ class Backlog:
             queue.behind = queue.stored > 0
             if queue.stored:
                 queue.note_restored(self._number)
+        for each in single.difference(value.single for value in values.values()):
+            self._single.remove(each)
+        for (name, topic), value in sorted(values.items(), key=lambda each: each[1].number):
+            queue = self._orphaned(name)
+            if (value.qos or not queue.mixed) and queue.last_stored(topic):
+                value.after = value.number  # numbers of the journal are below, or of newer messages
+            self._keep_latest(queue, value)
+            self._count(queue, 1, value.size)
         for record, size, key in sorted(later, key=lambda each: each[0].number):
             entry = Entry(self._orphaned(record.rule), record, size)
             entry.key = key
@@ -323,30 +360,53 @@ class Backlog:
             self._again_size += size + ENTRY_OVERHEAD
             entry.queue.again.append(entry)
             self._repeated.add(record.number)
-        for queue in self._queues.values():
-            by_number = sorted(queue.latest.items(), key=lambda each: record_times(each[1][0])[0])
-            queue.latest.clear()
-            queue.latest.update(by_number)
         self._counts.restored = self._messages
 
-    def _restore_row(self, key: int, row: bytes, later: list[tuple[Record, int, int]]) -> None:
+    def _restore_row(
+        self,
+        key: int,
+        row: bytes,
+        later: list[tuple[Record, int, int]],
+        values: dict[tuple[str, str], LatestValue],
+        single: set[int],
+    ) -> None:
+        """Take over a row; `single` are the keys of records that are stored by themselves.
+
+        Raises ValueError.
+        """
         kind, data = row[:1], row[1:]
         if kind == _NUMBERS:
             self._numbers_key = key
             self._numbers = _decode_numbers(data)
             return
-        if kind not in (_LATEST, _LATER):
+        if kind == _LATER:
+            later.append((Record.decode(data), len(data), key))
+            return
+        if kind == _LATEST:
+            own, size = None, len(data)
+        elif kind == _SINGLE:
+            if len(data) < _SINGLE_HEADER.size:
+                raise ValueError("too short")
+            own, size = _SINGLE_HEADER.unpack_from(data)
+            data = data[_SINGLE_HEADER.size :]
+        else:
             raise ValueError("of another version")
         record = Record.decode(data)
-        if kind == _LATER:
-            later.append((record, len(data), key))
-            return
-        queue = self._orphaned(record.rule)
-        before = queue.latest.pop(record.topic, None)
+        if own is not None and own not in single:
+            raise ValueError("the record of a row is missing")
+        before = values.get((record.rule, record.topic))
         if before is not None:  # a rule's rows have one topic each, unless it was damaged
-            self._remove_latest(queue, record.topic, before)
-        self._keep_latest(queue, record.topic, data, key)
-        self._count(queue, 1, len(data))
+            raise ValueError("a second row of a topic")
+        expires = math.inf if record.expires_at is None else record.expires_at
+        value = LatestValue(
+            record.topic, record.number, record.qos, size, record.stored_at, expires
+        )
+        value.key = key
+        if own is None:
+            value.data = data
+        else:
+            value.single = own
+        values[record.rule, record.topic] = value
 
     def _orphaned(self, name: str) -> RuleQueue:
         """The queue of a rule that may not be in the configuration any more."""
@@ -397,31 +457,30 @@ class Backlog:
         size = len(data)
         while self._bytes + size > self._limits.size:
             replaced = queue.latest.get(topic) if kept == "latest" else None
-            added = size - len(replaced[0]) if replaced is not None else size
+            added = size - replaced.size if replaced is not None else size
             if self._bytes + added <= self._limits.size:
                 break
             if not self._make_room(queue.lane, added, now):
                 return self._refuse(queue)
-        overflows = False
-        if kept == "latest":
-            if queue.overflows(topic) or not self._has_latest_room(queue, topic, size):
-                overflows = True
-            elif qos and queue.may_store(topic):
-                kept = "all"  # it may not overtake an older message of its topic
-        if overflows:
+        if kept == "all":
             if self._backlogs.failing:
                 return self._cannot_store(queue, qos)
-            self._append_latest(queue, topic, data, number, awaited=qos > 0)
-        elif kept == "all":
-            if self._backlogs.failing:
-                return self._cannot_store(queue, qos)
-            if queue.latest and topic in queue.latest:
-                self._move_latest(queue, topic)
             self._append(queue, topic, data, number, awaited=qos > 0)
         elif kept == "latest":
-            if (qos or retain) and self._backlogs.failing:
+            persistent = qos > 0 or retain
+            while not (in_memory := self._has_latest_room(queue, topic, size)):
+                before = queue.latest.get(topic)
+                if (before is not None and before.single is not None) or self._has_topic_room(
+                    topic
+                ):
+                    break
+                if self._limits.when_full == "refuse" or not self._drop_oldest_latest(queue.lane):
+                    return self._refuse(queue)
+            if (persistent or not in_memory) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
-            self._offer_latest(queue, topic, data, persistent=qos > 0 or retain, qos=qos)
+            expires = math.inf if expires_at is None else expires_at
+            value = LatestValue(topic, number, qos, size, now, expires)
+            self._offer_latest(queue, value, data, persistent=persistent, in_memory=in_memory)
         else:
             memory = size + LOADED_OVERHEAD
             if not self._make_live_room(queue.lane, memory):
@@ -496,76 +555,154 @@ class Backlog:
 
     def _has_latest_room(self, queue: RuleQueue, topic: str, size: int) -> bool:
         """Whether there is memory for a record of this size as the latest of its topic."""
-        place = queue.latest.get(topic)
-        before = 0 if place is None else len(place[0]) + LATEST_OVERHEAD
+        value = queue.latest.get(topic)
+        before = 0 if value is None or value.single is not None else value.size + LATEST_OVERHEAD
         return self._live_size - before + size + LATEST_OVERHEAD <= LATEST_SIZE
 
+    def _has_topic_room(self, topic: str) -> bool:
+        """Whether there is memory for one more topic whose latest message is only on disk."""
+        return self._topics_size + len(topic) + SINGLE_OVERHEAD <= TOPICS_SIZE
+
     def _offer_latest(
-        self, queue: RuleQueue, topic: str, data: bytes, *, persistent: bool, qos: int
+        self,
+        queue: RuleQueue,
+        value: LatestValue,
+        data: bytes,
+        *,
+        persistent: bool,
+        in_memory: bool,
     ) -> None:
         """Keep it as the latest of its topic, in place of an older one."""
-        key = self._replace_latest(queue, topic)
-        if persistent or key is not None:
-            key = self._latest.put(key, _LATEST + data, awaited=qos > 0)
-        self._keep_latest(queue, topic, data, key)
+        key, single = self._replace_latest(queue, value.topic)
+        awaited = value.qos > 0
+        if value.qos or not queue.mixed:  # MQTT does not order QoS 0 and others
+            value.after = queue.last_stored(value.topic)
+        if in_memory:
+            value.data = data
+            if persistent or key is not None:
+                key = self._latest.put(key, _LATEST + data, awaited=awaited)
+        else:
+            value.single = self._single.put(data, awaited=awaited)
+            row = _SINGLE + _SINGLE_HEADER.pack(value.single, value.size) + record_head(data)
+            key = self._latest.put(key, row, awaited=awaited)
+        if single is not None:
+            self._single.remove(single)
+        value.key = key
+        self._keep_latest(queue, value)
 
-    def _append_latest(
-        self, queue: RuleQueue, topic: str, data: bytes, number: int, *, awaited: bool
-    ) -> None:
-        """Store it as the latest of its topic in the journal, in place of an older one."""
-        key = self._replace_latest(queue, topic)
-        queue.latest.pop(topic, None)
-        if key is not None:
-            self._latest.remove(key)
-        segment = self._append(queue, topic, data, number, awaited=awaited)
-        queue.note_topic(topic, number)
-        replaced = queue.overflow.note(topic, number, segment.key)
-        if replaced is None or not queue.behind:
-            return
-        assert queue.journal is not None
-        outdated = queue.overflow.outdated(replaced, queue.journal.segments())
-        if outdated is not None and queue.is_unread(outdated):
-            self._drop_unread(queue, outdated, DropReason.REPLACED)
-
-    def _replace_latest(self, queue: RuleQueue, topic: str) -> int | None:
-        """A newer message of the topic has come: end the older one; returns the key of its row."""
-        key: int | None = None
-        place = queue.latest.get(topic)
-        if place is not None:
-            key = place[1]
-            self._uncount(queue, len(place[0]))
-            self._live_size -= len(place[0]) + LATEST_OVERHEAD
+    def _replace_latest(self, queue: RuleQueue, topic: str) -> tuple[int | None, int | None]:
+        """A newer message of the topic has come: end the older one; returns the keys of its row and
+        of its record, which is not needed any more once the row is the newer one's."""
+        value = queue.latest.get(topic)
+        if value is not None:
+            self._uncount(queue, value.size)
+            self._free_latest(queue, value)
             self._drop(queue, DropReason.REPLACED)
-        elif topic in queue.newest:
-            before = queue.newest[topic]
-            key, before.key = before.key, None  # the row becomes the newer message's
-            if before.state in (AGAIN, LATER):
-                self._discard(before, DropReason.REPLACED)
-        return key
+            return value.key, value.single
+        before = queue.newest.get(topic)
+        if before is None:
+            return None, None
+        key, single = before.key, before.single
+        before.key = before.single = None
+        if before.state in (AGAIN, LATER):
+            self._discard(before, DropReason.REPLACED)
+        return key, single
 
-    def _keep_latest(self, queue: RuleQueue, topic: str, data: bytes, key: int | None) -> None:
-        queue.latest[topic] = data, key
-        self._live_size += len(data) + LATEST_OVERHEAD
+    def _keep_latest(self, queue: RuleQueue, value: LatestValue) -> None:
+        queue.latest.put(value)
+        self._earliest_end = min(self._earliest_end, self._end_of(value))
+        if value.single is None:
+            self._live_size += value.size + LATEST_OVERHEAD
+        else:
+            self._topics_size += len(value.topic) + SINGLE_OVERHEAD
 
-    def _remove_latest(self, queue: RuleQueue, topic: str, place: tuple[bytes, int | None]) -> None:
-        """It is not in `latest` any more: end its row and its count."""
-        data, key = place
-        self._live_size -= len(data) + LATEST_OVERHEAD
-        self._uncount(queue, len(data))
+    def _free_latest(self, queue: RuleQueue, value: LatestValue) -> None:
+        """Its memory is not needed for the value any more."""
+        if value.single is None:
+            self._live_size -= value.size + LATEST_OVERHEAD
+            return
+        self._topics_size -= len(value.topic) + SINGLE_OVERHEAD
+        if value.is_read:
+            value.is_read = False
+            queue.values_read -= 1
+            self._values_size -= value.size
+
+    def _drop_latest(self, queue: RuleQueue, value: LatestValue, reason: DropReason) -> None:
+        queue.latest.pop(value)
+        self._free_latest(queue, value)
+        self._uncount(queue, value.size)
+        self._remove_rows(value.key, value.single)
+        self._drop(queue, reason)
+
+    def _remove_rows(self, key: int | None, single: int | None) -> None:
         if key is not None:
             self._latest.remove(key)
+        if single is not None:
+            self._single.remove(single)
 
-    def _move_latest(self, queue: RuleQueue, topic: str) -> None:
-        """A message that waits as the latest of its topic becomes one of all: more follow it."""
-        data, key = queue.latest[topic]
-        record = Record.decode(data)
-        if not record.qos:
-            return  # MQTT orders messages of a topic and a QoS
-        del queue.latest[topic]
-        self._live_size -= len(data) + LATEST_OVERHEAD
-        self._append(queue, topic, data, record.number, awaited=True)
-        if key is not None:
-            self._latest.remove(key)
+    def _drop_oldest_latest(self, lane: int) -> bool:
+        """Drop the oldest latest message of the lowest lane that is not above; False if none."""
+        self._say_full()
+        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
+            firsts = [
+                (value.number, queue, value)
+                for queue in self._lanes[lowest]
+                if (value := queue.latest.oldest()) is not None
+            ]
+            if firsts:
+                _, queue, value = min(firsts, key=lambda each: each[0])
+                self._drop_latest(queue, value, DropReason.FULL)
+                return True
+        return False
+
+    # --- reading the latest -----------------------------------------------------------------------
+
+    def _read_values(self, queue: RuleQueue, now: float) -> None:
+        """Read the next values that are only on disk, if there is memory for them."""
+        for place, value in enumerate(queue.latest.ready.values()):
+            if place == VALUES_AT_ONCE or not self._read_value(queue, value, now):
+                break
+
+    def _read_value(self, queue: RuleQueue, value: LatestValue, now: float) -> bool:
+        """Read one, if it is not in memory; False if it cannot be read now.
+
+        Each rule may have one, and the link `VALUES_SIZE` bytes.
+        """
+        if value.single is None or value.is_read:
+            return True
+        if queue.values_failed:
+            queue.values_failed = False
+            queue.values_at = now + READ_AGAIN
+        if queue.values_at > now:
+            return False
+        if queue.values_read and self._values_size + value.size > VALUES_SIZE:
+            return False
+        value.is_read = True
+        queue.values_read += 1
+        self._values_size += value.size
+        self._single.read(value.single, partial(self._value_was_read, queue, value))
+        return True
+
+    def _value_was_read(
+        self, queue: RuleQueue, value: LatestValue, outcome: list[bytes] | Exception
+    ) -> None:
+        if queue.latest.get(value.topic) is not value:
+            return  # it was dropped meanwhile
+        if isinstance(outcome, list) and len(outcome) == 1 and len(outcome[0]) == value.size:
+            queue.values_at = 0.0
+            value.data = outcome[0]
+        elif isinstance(outcome, list | RecordsLostError):
+            self._drop_latest(queue, value, DropReason.UNREADABLE)
+        else:
+            if not queue.values_at:
+                log.warning("backlog of %s: cannot be read: %s", self._name, outcome)
+            queue.values_failed = True
+            value.is_read = False
+            queue.values_read -= 1
+            self._values_size -= value.size
+        if self._idle:
+            self._idle = False
+            self._wake()
 
     # --- full -------------------------------------------------------------------------------------
 
@@ -630,13 +767,13 @@ class Backlog:
         self._check_emptied(queue)
 
     def _drop_first_live(self, queue: RuleQueue, reason: DropReason) -> None:
-        if queue.latest:
-            topic, place = queue.latest.popitem(last=False)
-            self._remove_latest(queue, topic, place)
-        else:
-            data = queue.live.popleft()
-            self._live_size -= len(data) + LOADED_OVERHEAD
-            self._uncount(queue, len(data))
+        value = queue.latest.oldest()
+        if value is not None:
+            self._drop_latest(queue, value, reason)
+            return
+        data = queue.live.popleft()
+        self._live_size -= len(data) + LOADED_OVERHEAD
+        self._uncount(queue, len(data))
         self._drop(queue, reason)
 
     def _make_live_room(self, lane: int, memory: int) -> bool:
@@ -685,12 +822,7 @@ class Backlog:
         """Drop what has become too old; to be called every second or so."""
         for queue in self._queues.values():
             self._drop_outdated(queue, now)
-            for topic in [each for each, place in queue.latest.items() if self._why(place[0], now)]:
-                place = queue.latest.pop(topic)
-                self._remove_latest(queue, topic, place)
-                reason = self._why(place[0], now)
-                assert reason is not None
-                self._drop(queue, reason)
+        self._drop_outdated_latest(now)
         self._forget_drained()
         if self._full_since is not None and 2 * self._bytes < self._limits.size:
             count = self._dropped_as_full() - self._full_since
@@ -700,6 +832,24 @@ class Backlog:
                 self._name,
                 count,
             )
+
+    def _drop_outdated_latest(self, now: float) -> None:
+        """Drop the latest messages that are too old or expired; most often there can be none."""
+        if self._earliest_end > now:
+            return
+        self._earliest_end = math.inf
+        for queue in self._queues.values():
+            for value in list(queue.latest):
+                reason = self._too_old(value.stored_at, value.expires_at, now)
+                if reason is not None:
+                    self._drop_latest(queue, value, reason)
+                else:
+                    self._earliest_end = min(self._earliest_end, self._end_of(value))
+
+    def _end_of(self, value: LatestValue) -> float:
+        """When it will be too old."""
+        age = self._limits.age
+        return value.expires_at if age is None else min(value.expires_at, value.stored_at + age)
 
     def _drop_outdated(self, queue: RuleQueue, now: float) -> None:
         """Drop what is too old or expired, from the front of the queue."""
@@ -743,8 +893,18 @@ class Backlog:
         self._online = True
         held = self._queues.get(HELD)
         if held is not None:
+            self._end_passes(held)
             more = packet_size > self._held_at
             held.passes = held.messages if more else len(held.again)
+            if more:
+                self._held_before, self._held_at = self._held_at, math.inf
+
+    def _end_passes(self, held: RuleQueue) -> None:
+        """The connection has ended: what it was not sent was too large for those before."""
+        if held.passes > 0:
+            self._held_at = min(self._held_at, self._held_before)
+        self._held_before = math.inf
+        held.passes = 0
 
     def next(self, now: float) -> Entry | None:
         """The next message to be sent; None when there is none, or when it may not be sent yet.
@@ -856,7 +1016,15 @@ class Backlog:
             for queue in queues:
                 if not queue.passes:
                     continue  # of what waits here nothing may be sent
-                if queue.waiting or queue.again or queue.latest or queue.live or queue.behind:
+                latest = queue.latest
+                if (
+                    queue.waiting
+                    or queue.again
+                    or latest.ready
+                    or latest.blocked
+                    or queue.live
+                    or queue.behind
+                ):
                     if found is None:
                         found = queue
                     elif found.lane == queue.lane:
@@ -867,7 +1035,6 @@ class Backlog:
             or found.latest
             or found.live
             or found.bucket is not None
-            or found.overflow  # some may have been replaced
             or found.name == HELD
             or (found.behind and found.reading is None and 2 * found.loaded <= self._share)
         ):
@@ -889,27 +1056,39 @@ class Backlog:
         for _ in range(MOST_DROPPED):
             stored: RuleQueue | None = None
             live: RuleQueue | None = None
+            live_number = math.inf
             for queue in self._lanes[lane]:
                 if not queue.messages or not queue.passes:
                     continue
                 bucket = queue.bucket
                 if bucket is not None and bucket.due(now) > now:
                     continue
-                again = queue.again
+                again, latest = queue.again, queue.latest
                 if again and again[0].state == GONE:
                     queue.skip_gone()
                 if only_again and not again:
                     continue
                 if queue.behind and queue.reading is None and 2 * queue.loaded <= self._share:
                     self._read_on(queue, now)
-                if (again or queue.waiting) and (
-                    stored is None or queue.first_number() < stored.first_number()
+                if latest.blocked:
+                    latest.unblock(queue.first_number_stored())
+                if latest.ready and next(iter(latest.ready.values())).data is None:
+                    self._read_values(queue, now)
+                if queue.held_up_by is not None and queue.is_held_up():
+                    self._read_value(queue, queue.held_up_by, now)
+                    is_held_up = not again
+                else:
+                    is_held_up = False
+                if (
+                    (again or queue.waiting)
+                    and not is_held_up
+                    and (stored is None or queue.first_number() < stored.first_number())
                 ):
                     stored = queue
-                if (queue.latest or queue.live) and (
-                    live is None or queue.first_live_number() < live.first_live_number()
+                if (latest.ready or queue.live) and (
+                    (number := queue.first_live_number()) is not None and number < live_number
                 ):
-                    live = queue
+                    live, live_number = queue, number
             if live is not None and (stored is None or self._live_first[lane]):
                 self._live_first[lane] = False
                 entry = self._take_live(live, now)
@@ -934,6 +1113,12 @@ class Backlog:
                 return None
             self._again_size -= entry.size + ENTRY_OVERHEAD
             return self._hand_out(entry, now)
+        if queue.latest and (value := queue.latest_before()) is not None:
+            if value.data is not None:
+                return self._take_latest(queue, value, now)
+            queue.held_up_by = value
+            self._read_value(queue, value, now)
+            return None
         data, part, index = self._pop_waiting(queue)
         try:
             record = Record.decode(data)
@@ -941,9 +1126,6 @@ class Backlog:
         except ValueError as error:
             log.warning("backlog of %s: a message is unreadable: %s", self._name, error)
             reason = DropReason.UNREADABLE
-        else:
-            if queue.overflow and queue.was_replaced(record):
-                reason = DropReason.REPLACED
         if reason is not None:
             self._uncount(queue, len(data))
             self._drop(queue, reason)
@@ -960,25 +1142,15 @@ class Backlog:
         entry = Entry(queue, record, len(data))
         entry.part = part
         entry.index = index
+        if queue.name == HELD and record.rule in self._queues:
+            entry.qos = self._queues[record.rule].qos
         return self._hand_out(entry, now)
 
     def _take_live(self, queue: RuleQueue, now: float) -> Entry | None:
-        if queue.latest:
-            topic, place = queue.latest.popitem(last=False)
-            data, key = place
-            reason = self._why(data, now)
-            if reason is not None:
-                self._remove_latest(queue, topic, place)
-                self._drop(queue, reason)
-                return None
-            self._live_size -= len(data) + LATEST_OVERHEAD
-            entry = Entry(queue, Record.decode(data), len(data))
-            entry.key = key
-            entry.topic = topic
-            queue.newest[topic] = entry
-            if key is None or queue.rule.qos == 0:
-                entry.qos = min(1, entry.record.qos)
-            return self._hand_out(entry, now)
+        for value in queue.latest.ready.values():
+            if value.data is not None:
+                return self._take_latest(queue, value, now)
+            break
         data = queue.live.popleft()
         self._live_size -= len(data) + LOADED_OVERHEAD
         reason = self._why(data, now)
@@ -987,7 +1159,32 @@ class Backlog:
             self._drop(queue, reason)
             return None
         entry = Entry(queue, Record.decode(data), len(data))
-        entry.qos = min(1, entry.record.qos)
+        entry.qos = min(queue.qos, entry.record.qos)
+        return self._hand_out(entry, now)
+
+    def _take_latest(self, queue: RuleQueue, value: LatestValue, now: float) -> Entry | None:
+        """Hand out a value that is in memory; None when it was too old, or is unreadable."""
+        data = value.data
+        assert data is not None
+        reason = self._too_old(value.stored_at, value.expires_at, now)
+        if reason is None:
+            try:
+                record = Record.decode(data)
+            except ValueError as error:
+                log.warning("backlog of %s: a message is unreadable: %s", self._name, error)
+                reason = DropReason.UNREADABLE
+        if reason is not None:
+            self._drop_latest(queue, value, reason)
+            return None
+        queue.latest.pop(value)
+        self._free_latest(queue, value)
+        entry = Entry(queue, record, value.size)
+        entry.key = value.key
+        entry.single = value.single
+        entry.topic = value.topic
+        queue.newest[value.topic] = entry
+        if not record.retain:
+            entry.qos = min(queue.qos, record.qos)
         return self._hand_out(entry, now)
 
     def _hand_out(self, entry: Entry, now: float) -> Entry:
@@ -1039,7 +1236,7 @@ class Backlog:
             heapq.heappop(self._later)
         times = [due for due, _, _ in self._later[:1]]
         for queue in self._queues.values():
-            times.append(queue.read_at)
+            times += (queue.read_at, queue.values_at)
             if queue.bucket is not None and queue.messages:
                 times.append(queue.bucket.due(now))
         return min((due for due in times if due > now), default=None)
@@ -1188,14 +1385,19 @@ class Backlog:
     def hold(self, entry: Entry, packet_size: int) -> bool:
         """The fleet's broker takes only smaller packets now: keep it until one takes more, and send
         what follows. False for what only counts as long as nothing newer has come, or is not
-        stored."""
+        stored, and where too much is kept so."""
         if entry.topic is not None or (entry.part is None and entry.key is None):
             return False
-        self._held_at = max(self._held_at, packet_size)
         held = self._orphaned(HELD)
+        if entry.queue is not held and (
+            held.messages >= MOST_HELD or held.bytes + entry.size > self._limits.size * HELD_SHARE
+        ):
+            return False
         if not held.messages:
             held.passes = 0
+            self._held_at = packet_size
             self._sort()
+        self._held_at = min(self._held_at, packet_size)
         record = entry.record
         data = record.encode()
         self._append(held, record.topic, data, record.number, awaited=False)
@@ -1219,6 +1421,9 @@ class Backlog:
         What is only for a connection is forgotten.
         """
         self._online = False
+        held = self._queues.get(HELD)
+        if held is not None:
+            self._end_passes(held)
         flying = list(self._flying.values())
         self._flying.clear()
         self._flying_size = 0
@@ -1270,8 +1475,8 @@ class Backlog:
             queue.settle(part, entry.index)
             self._check_emptied(queue)
         if entry.key is not None:
-            self._latest.remove(entry.key)
-            entry.key = None
+            self._remove_rows(entry.key, entry.single)
+            entry.key = entry.single = None
         if entry.topic is not None and queue.newest.get(entry.topic) is entry:
             del queue.newest[entry.topic]
 

@@ -24,6 +24,8 @@ _LENGTH: Final = _HEADER.size
 
 #: The part of the header that a waiting record is asked for.
 _TIMES: Final = Struct(">xQdd")
+#: The part of the header with the lengths of the texts.
+_TEXTS: Final = Struct(">26xHH")
 
 _QOS: Final = 0x03
 _RETAIN: Final = 0x04
@@ -121,6 +123,23 @@ def encode_record(
         len(payload),
     )
     return b"".join((header, rule, name, properties_wire, payload))
+
+
+def record_head(data: bytes) -> bytes:
+    """The record without its properties and payload: one that says what it is and its times."""
+    fields = _HEADER.unpack_from(data)
+    rule_size, topic_size = fields[5:7]
+    header = _HEADER.pack(*fields[:7], len(NO_PROPERTIES), 0)
+    return header + data[_LENGTH : _LENGTH + rule_size + topic_size] + NO_PROPERTIES
+
+
+def record_topic(data: bytes) -> str:
+    """A record's topic. Raises ValueError."""
+    if len(data) < _LENGTH:
+        raise ValueError("no record")
+    rule_size, topic_size = _TEXTS.unpack_from(data)
+    start = _LENGTH + rule_size
+    return data[start : start + topic_size].decode()
 
 
 def record_times(data: bytes) -> tuple[int, float, float]:

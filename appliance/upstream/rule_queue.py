@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from array import array
-from bisect import bisect_left, bisect_right, insort
-from collections import OrderedDict, deque
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections import deque
 from operator import attrgetter
 from typing import Final
 
 from appliance.broker.ports import Journal, Segment
+from appliance.upstream.latest_values import LatestValue, LatestValues
 from appliance.upstream.rates import TokenBucket
-from appliance.upstream.records import Record, record_times
+from appliance.upstream.records import Record, record_times, record_topic
 from appliance.upstream.rules import OutRule
 
 #: Bytes of memory beside its own that are counted for a record that was read, for the latest record
@@ -25,13 +25,12 @@ LOADED_OVERHEAD: Final = 64
 LATEST_OVERHEAD: Final = 400
 ENTRY_OVERHEAD: Final = 500
 
-#: Slots of the table of topics that the journal may contain, see `RuleQueue.may_store`.
+#: Slots of the table of topics that the journal may contain, see `RuleQueue.last_stored`.
 _TOPICS: Final = 4096
 
-#: Bytes of the topics of which the latest message is in the journal, and what is counted for one
-#: beside its text.
-OVERFLOW_SIZE: Final = 16 << 20
-OVERFLOW_OVERHEAD: Final = 300
+#: What is counted for a topic whose latest message is only on disk, beside its text: for what is in
+#: memory here and in the store.
+SINGLE_OVERHEAD: Final = 600
 
 # States of an entry.
 IN_FLIGHT: Final = 0
@@ -75,6 +74,7 @@ class Entry:
         "qos",
         "queue",
         "record",
+        "single",
         "size",
         "state",
         "topic",
@@ -85,82 +85,19 @@ class Entry:
         self.record = record
         #: Bytes of the encoded record.
         self.size = size
-        self.qos = 1
+        self.qos = queue.qos
         self.expiry: int | None = None
         self.published_at: float | None = None
         self.attempts = 0
         self.state = IN_FLIGHT
-        #: Where it is stored: in the journal, as a row of its own, or not at all.
+        #: Where it is stored: in the journal, as a row of its own, or not at all. Of a row the
+        #: record may be apart, by the key `single`.
         self.part: HeldSegment | None = None
         self.index = 0
         self.key: int | None = None
+        self.single: int | None = None
         #: Its topic, when it counts only as long as it is the latest one of it.
         self.topic: str | None = None
-
-
-class Overflow:
-    """Which records of a journal are the latest ones of their topics: those without room elsewhere.
-
-    Of a topic that has no room here either, at most `OVERFLOW_SIZE`, all messages are sent.
-    """
-
-    def __init__(self) -> None:
-        #: By topic: the number of the record, and the key of its segment when it was appended.
-        self._newest: dict[str, tuple[int, int]] = {}
-        self._size = 0
-        #: By segment: how many records in it count no more. The keys are in order.
-        self._replaced: dict[int, int] = {}
-        self._keys: list[int] = []
-
-    def __bool__(self) -> bool:
-        return bool(self._newest)
-
-    def __contains__(self, topic: str) -> bool:
-        return topic in self._newest
-
-    def get(self, topic: str) -> int | None:
-        """The number of the topic's latest record."""
-        found = self._newest.get(topic)
-        return None if found is None else found[0]
-
-    def note(self, topic: str, number: int, segment: int) -> int | None:
-        """A record was appended; returns the segment of the one that it replaces, if any."""
-        before = self._newest.get(topic)
-        if before is None:
-            size = len(topic) + OVERFLOW_OVERHEAD
-            if self._size + size > OVERFLOW_SIZE:
-                return None
-            self._size += size
-        self._newest[topic] = number, segment
-        return None if before is None else before[1]
-
-    def forget(self, topic: str) -> None:
-        """The topic's latest record is being sent."""
-        if self._newest.pop(topic, None) is not None:
-            self._size -= len(topic) + OVERFLOW_OVERHEAD
-
-    def outdated(self, key: int, segments: Sequence[Segment]) -> Segment | None:
-        """One more record counts no more, which was appended to the segment with this key: the
-        segment that it is in now, when nothing in that counts any more."""
-        place = bisect_right(segments, key, key=attrgetter("key")) - 1
-        if place < 0:
-            return None
-        segment = segments[place]
-        if key not in self._replaced:
-            insort(self._keys, key)
-        self._replaced[key] = self._replaced.get(key, 0) + 1
-        # Segments that only wait are merged; the first one gives its key.
-        first = bisect_left(self._keys, segment.key)
-        end = len(self._keys)
-        if place + 1 < len(segments):
-            end = bisect_left(self._keys, segments[place + 1].key)
-        if sum(self._replaced[each] for each in self._keys[first:end]) < segment.count:
-            return None
-        for each in self._keys[:end]:  # those before it are of segments that are not there
-            if each >= segment.key or each < segments[0].key:
-                del self._replaced[each]
-        self._keys = sorted(self._replaced)
-        return segment
 
 
 class RuleQueue:
@@ -208,8 +145,14 @@ class RuleQueue:
         self.spilled: Segment | None = None
 
         self.again: deque[Entry] = deque()
-        #: By topic: the record, and the key of its row.
-        self.latest: OrderedDict[str, tuple[bytes, int | None]] = OrderedDict()
+        self.latest = LatestValues()
+        #: Of them, those that are being read or were.
+        self.values_read = 0
+        #: Reading one failed; it is tried again at `values_at`.
+        self.values_failed = False
+        self.values_at = 0.0
+        #: The value that goes before the first record in `waiting`, and is only on disk.
+        self.held_up_by: LatestValue | None = None
         #: By topic: the newest entry of it that is not settled.
         self.newest: dict[str, Entry] = {}
         self.live: deque[bytes] = deque()
@@ -218,16 +161,14 @@ class RuleQueue:
         #: to `emptied` are not there any more.
         self._topics: array[int] | None = None
         self._emptied = 0
-        #: Whether the journal has records from before the start, of topics that are not known.
-        self._is_restored = False
-        #: The latest ones of topics that are in the journal.
-        self.overflow = Overflow()
 
     def use(self, rule: OutRule) -> None:
         """Follow the rule as it is from now on."""
         self.rule = rule
         self.lane = rule.lane
         self.mixed = rule.keep == "auto"
+        #: The most QoS of what is sent.
+        self.qos = 0 if rule.qos == 0 else 1
         #: By QoS and retain: how a message waits.
         self.kept = tuple(rule.kept(qos, retain) for qos in range(3) for retain in (False, True))
 
@@ -239,46 +180,48 @@ class RuleQueue:
             self._topics = array("Q", bytes(8 * _TOPICS))
         self._topics[hash(topic) % _TOPICS] = number
 
-    def may_store(self, topic: str) -> bool:
-        """Whether the journal may contain a record of the topic that is not settled.
-
-        It may not be overtaken by a newer one.
-        """
-        return (
-            self.stored > 0
-            and self._topics is not None
-            and self._topics[hash(topic) % _TOPICS] > self._emptied
-        )
+    def last_stored(self, topic: str) -> int:
+        """The number up to which the journal may contain records of the topic that are not settled,
+        which a newer one may not overtake; 0 if it contains none."""
+        if not self.stored or self._topics is None:
+            return 0
+        number = self._topics[hash(topic) % _TOPICS]
+        return number if number > self._emptied else 0
 
     def note_restored(self, number: int) -> None:
         """The journal has records of any topic, up to this number."""
         self._topics = array("Q", [number]) * _TOPICS
-        self._is_restored = True
 
-    def overflows(self, topic: str) -> bool:
-        """Whether the latest message of a topic is stored in the journal as an older one of it is,
-        or may be: it may not overtake that."""
-        return topic in self.overflow or (self._is_restored and self.may_store(topic))
+    def first_number_stored(self) -> float:
+        """A number below which nothing of `again` and the journal waits; infinity without any."""
+        self.skip_gone()
+        if self.again:
+            return 0
+        if self.waiting:
+            return record_times(self.waiting[0])[0]
+        return 0 if self.behind else math.inf
 
-    def was_replaced(self, record: Record) -> bool:
-        """Whether a record of the journal counts no more, as a newer one of its topic does."""
-        newest = self.overflow.get(record.topic)
-        if newest is None:
+    def latest_before(self) -> LatestValue | None:
+        """The value that is to be sent before the first record in `waiting`: it was published
+        before, for the same topic. (MQTT does not order QoS 0 and others.)"""
+        data = self.waiting[0]
+        try:
+            value = self.latest.get(record_topic(data))
+        except ValueError:
+            return None
+        if value is None or not value.qos or value.number > record_times(data)[0]:
+            return None
+        return value
+
+    def is_held_up(self) -> bool:
+        """Whether the first record in `waiting` has to wait until a value was read."""
+        value = self.held_up_by
+        if value is None:
             return False
-        if record.number >= newest:
-            self.overflow.forget(record.topic)
-            return False
-        return self.kept[2 * record.qos + record.retain] == "latest"
-
-    def is_unread(self, segment: Segment) -> bool:
-        """Whether nothing of the segment is in memory, nor will be soon."""
-        assert self.journal is not None
-        last = self.last
-        return (
-            segment is not self.reading
-            and (last is None or segment.key > last.segment.key)
-            and segment is not self.journal.segments()[-1]
-        )
+        if value.data is None and self.latest.get(value.topic) is value:
+            return True
+        self.held_up_by = None
+        return False
 
     # --- the journal ----------------------------------------------------------------------------
 
@@ -393,9 +336,6 @@ class RuleQueue:
     def empty(self, number: int) -> None:
         """Nothing up to this number is in the journal any more."""
         self._emptied = number
-        self._is_restored = False
-        if self.overflow:
-            self.overflow = Overflow()
 
     def drop_unread(self, segment: Segment | None) -> tuple[int, int]:
         """Drop what is not in memory of the oldest segment of which something is not: the number of
@@ -436,15 +376,13 @@ class RuleQueue:
             return self.again[0].record.number
         return record_times(self.waiting[0])[0]
 
-    def first_live_number(self) -> int:
-        """The number of the first record in `latest` or `live`."""
-        return record_times(self.first_live())[0]
-
-    def first_live(self) -> bytes:
-        """The first record in `latest` or `live`, one of which is not empty."""
-        if self.latest:
-            return next(iter(self.latest.values()))[0]
-        return self.live[0]
+    def first_live_number(self) -> int | None:
+        """The number of the first record in `latest` or `live` that can be handed out."""
+        for value in self.latest.ready.values():
+            if value.data is not None:
+                return value.number
+            break
+        return record_times(self.live[0])[0] if self.live else None
 
     def oldest_stored(self) -> float | None:
         """When the oldest message was published, among those that can be dropped of `again` and
@@ -459,9 +397,10 @@ class RuleQueue:
 
     def oldest_live(self) -> float | None:
         """When the first message of `latest` or `live` was published."""
-        if not self.latest and not self.live:
-            return None
-        return record_times(self.first_live())[1]
+        value = self.latest.oldest()
+        if value is not None:
+            return value.stored_at
+        return record_times(self.live[0])[1] if self.live else None
 
 
 def size_left(segment: Segment) -> int:

@@ -110,6 +110,22 @@ class PlainRecords:
         self.rows.pop(key, None)
 
 
+class PlainSingle(PlainRecords):
+    """A `SingleRecords`."""
+
+    def load(self) -> list[int]:  # type: ignore[override]
+        return sorted(self.rows)
+
+    def put(self, record: bytes, *, awaited: bool = True) -> int:  # type: ignore[override]
+        return super().put(None, record)
+
+    def read(self, key: int, callback: RecordsRead) -> None:
+        self.owner.reads += 1
+        records = [self.rows[key]] if key in self.rows else []
+        outcome = self.owner.failures.popleft() if self.owner.failures else records
+        self.owner.rounds.append(lambda: callback(outcome))
+
+
 class PlainBacklogs:
     """A `Backlogs` of one link. `rounds` are the next ones of the event loop."""
 
@@ -125,6 +141,7 @@ class PlainBacklogs:
         self.journals: dict[int, PlainJournal] = {}
         self.latest_records = PlainRecords(self)
         self.aside_records = PlainRecords(self)
+        self.single_records = PlainSingle(self)
         self.disk = self.snapshot()
 
     def key(self) -> int:
@@ -139,6 +156,9 @@ class PlainBacklogs:
 
     def aside(self, link: str) -> PlainRecords:
         return self.aside_records
+
+    def single(self, link: str) -> PlainSingle:
+        return self.single_records
 
     def links(self) -> list[str]:
         raise NotImplementedError
@@ -156,8 +176,8 @@ class PlainBacklogs:
             lane: [(copy.copy(each), list(journal.records[each.key])) for each in journal.list]
             for lane, journal in self.journals.items()
         }
-        rows = dict(self.latest_records.rows), dict(self.aside_records.rows)
-        return journals, rows
+        records = self.latest_records, self.aside_records, self.single_records
+        return journals, tuple(dict(each.rows) for each in records)
 
     def commit(self) -> None:
         """What was staged is on disk, and segments end."""
@@ -170,12 +190,13 @@ class PlainBacklogs:
         again = PlainBacklogs(self.segment_size)
         again.time = self.time
         again.keys = self.keys
-        journals, (latest, aside) = copy.deepcopy(self.disk)  # type: ignore[misc]
+        journals, (latest, aside, single) = copy.deepcopy(self.disk)  # type: ignore[misc]
         for lane, segments in journals.items():
             journal = again.journal("", lane)
             journal.list = [segment for segment, _ in segments]
             journal.records = {segment.key: records for segment, records in segments}
         again.latest_records.rows = latest
         again.aside_records.rows = aside
+        again.single_records.rows = single
         again.disk = again.snapshot()
         return again
