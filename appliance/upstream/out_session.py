@@ -223,7 +223,6 @@ class OutSession:
             expires_at += now - broker.now
             if expires_at <= now:
                 return
-        qos = message.qos if rule.qos is None else min(message.qos, rule.qos)
         retain = message.retain if rule.retain is None else rule.retain
         try:
             topic, properties = self._properties(topic, message)
@@ -231,7 +230,7 @@ class OutSession:
                 rule,
                 topic,
                 message.payload,
-                qos,
+                message.qos,  # how it waits; the rule's `qos` is about how it is sent
                 retain,
                 properties,
                 expires_at,

@@ -6,6 +6,7 @@ They are put together as bytes, as every message that has waited needs it.
 from __future__ import annotations
 
 from datetime import datetime, timezone
+from math import floor
 from typing import Final
 
 from appliance.mqtt.codec import Property, decode_varint, encode_string, encode_varint
@@ -29,7 +30,7 @@ class PublishProperties:
     """Puts properties together; what consecutive messages have in common is encoded once."""
 
     def __init__(self) -> None:
-        self._second = -1
+        self._second: int | None = None
         self._until_second = b""
 
     def encode(
@@ -57,7 +58,7 @@ class PublishProperties:
         The text up to the second is kept: the whole of it costs 3 µs, and what waited was
         published in the same second as the message before it.
         """
-        second = int(at)
+        second = floor(at)  # also before 1970, where a computer's clock may start
         millisecond = round((at - second) * 1e6) // 1000
         if millisecond == 1000:
             second += 1

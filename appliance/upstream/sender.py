@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from appliance.host.clock import RELEASED
 from appliance.mqtt.codec import NO_PROPERTIES, V5, quote, reason_name
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream.agreement import EndedBy, Ending
@@ -16,6 +17,9 @@ from appliance.upstream.link import FleetConnection
 from appliance.upstream.publish_properties import PublishProperties
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.transport import WRITE_PORTION
+
+#: The wall clock below which it was not set.
+_RELEASED: Final = RELEASED.timestamp()
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +101,9 @@ class Sender:
     def send(self, connection: FleetConnection[Entry | None]) -> bool:
         """Hand messages to the connection; True if there may be more for another turn."""
         now = self._clock()
-        offset = time.time() - now
+        wall = time.time()
+        # A date from a clock that was not set is worse than none.
+        offset = None if wall < _RELEASED else wall - now
         left = SENT_PER_TURN
         while left > 0:
             room, size = connection.room, WRITE_PORTION - connection.waiting
@@ -124,17 +130,19 @@ class Sender:
         return None if due is None else max(0.0, due - now)
 
     def _publish(
-        self, connection: FleetConnection[Entry | None], entry: Entry, offset: float
+        self, connection: FleetConnection[Entry | None], entry: Entry, offset: float | None
     ) -> None:
-        """Hand one to the connection; the wall clock is ahead of the backlog's by `offset`."""
+        """Hand one to the connection; the wall clock is ahead of the backlog's by `offset`: None
+        where it is not set."""
         record = entry.record
         topic, payload, limits = record.topic, record.payload, self._limits
         properties = NO_PROPERTIES
         if connection.settings.version == V5:
             properties = record.properties_wire
             at, number = entry.published_at, record.number if record.qos == 2 else None
+            if at is not None:
+                at = None if offset is None else at + offset
             if at is not None or number is not None or entry.expiry is not None:
-                at = None if at is None else at + offset
                 properties = self._properties.encode(properties, entry.expiry, number, at)
         topic_size, why = self._topics.get(topic) or self._look_at(topic)
         size = HEADER_SIZE + topic_size + len(properties) + len(payload)

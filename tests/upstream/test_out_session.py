@@ -55,7 +55,9 @@ def test_what_the_rules_carry_is_offered_as_it_is_there(rig: Rig) -> None:
     assert rig.out.counters.offered == 2
 
 
-def test_a_rule_may_say_with_which_qos_and_whether_retained(tmp_path: Path) -> None:
+def test_how_a_message_waits_is_up_to_its_publishers_qos_and_the_rules_retain(
+    tmp_path: Path,
+) -> None:
     out = "[{topic: a, qos: 0}, {topic: b, qos: 1, retain: true}, {topic: c, retain: false}]"
     rig = Rig(tmp_path, keys=f"user: upstream, out: {out}")
     rig.begin()
@@ -65,9 +67,9 @@ def test_a_rule_may_say_with_which_qos_and_whether_retained(tmp_path: Path) -> N
         peer.publish(f"r2/{topic}", b"x", 2, retain=True)
     assert [(each.topic[9:], each.qos, each.retain) for each in rig.backlog.offers] == [
         ("a", 0, False),
-        ("a", 0, True),
+        ("a", 2, True),
         ("b", 0, True),
-        ("b", 1, True),
+        ("b", 2, True),
         ("c", 0, False),
         ("c", 2, False),
     ]

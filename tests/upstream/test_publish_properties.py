@@ -37,7 +37,7 @@ def slow(
     return encode_varint(len(inside)) + inside
 
 
-TIMES = st.floats(min_value=1.0, max_value=1e10)
+TIMES = st.floats(min_value=-1e9, max_value=1e10)
 PROPERTIES = PublishProperties()  # one for all, as what it keeps is of another message
 
 
@@ -45,11 +45,13 @@ PROPERTIES = PublishProperties()  # one for all, as what it keeps is of another 
     st.sampled_from([0, 1, 60, 120, 130, 20_000]),
     st.none() | st.integers(0, 0xFFFF_FFFF),
     st.none() | st.integers(0, (1 << 64) - 1),
-    st.none() | TIMES | TIMES.map(int) | st.integers(1, 10**10).map(lambda n: n + 0.9999996),
+    st.none() | TIMES | TIMES.map(int) | st.integers(-(10**9), 10**10).map(lambda n: n + 0.9999996),
 )
 @example(0, None, None, 1_700_000_000.9995)
 @example(0, None, None, 1_700_000_000.9999999)
 @example(0, None, None, 1_699_999_999.9999999)
+@example(0, None, None, -4.653)
+@example(0, None, None, -1.0)
 def test_fast_and_slow_are_the_same(
     size: int, expiry: int | None, number: int | None, published_at: float | None
 ) -> None:

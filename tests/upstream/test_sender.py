@@ -1,0 +1,84 @@
+"""What a sender makes of what its backlog hands out."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from appliance.mqtt.codec import V5, PacketType, Property, decode_properties
+from appliance.upstream import sender as module
+from appliance.upstream.limits import FleetLimits
+from appliance.upstream.rule_queue import Entry
+from appliance.upstream.rules import KeepRule, OutRule
+from appliance.upstream.sender import Sender
+from upstream.test_backlog import Link
+
+
+class Connection:
+    """Takes what it is sent: topic, QoS and user properties."""
+
+    settings = SimpleNamespace(version=V5)
+    room, waiting, inflight = 100, 0, 0
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, int, object]] = []
+
+    def publish(
+        self, entry: Entry, topic: str, payload: bytes, qos: int, retain: bool, properties: bytes
+    ) -> int:
+        found, _ = decode_properties(properties, 0, len(properties), PacketType.PUBLISH)
+        self.sent.append((topic, qos, (found or {}).get(Property.USER_PROPERTY)))
+        return 0
+
+
+def send(link: Link) -> list[tuple[str, int, object]]:
+    sender = Sender("f", link.backlog, lambda: link.backlogs.time, FleetLimits())
+    sender.begin(FleetLimits())
+    connection = Connection()
+    while sender.send(connection) or link.backlogs.rounds:  # type: ignore[arg-type]
+        link.backlogs.turn()
+    return connection.sent
+
+
+@pytest.mark.parametrize(
+    ("wall", "expected"),
+    [
+        (1_800_000_000.0, [("published-at", "2027-01-15T07:59:55.000+00:00")]),
+        (3.0, None),  # the computer has started in 1970, and nobody knows the time
+    ],
+)
+def test_published_at_is_left_out_where_the_wall_clock_was_not_set(
+    wall: float, expected: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = Link()
+    link.offer("x")
+    link.backlogs.time += 5
+    monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda: wall))
+    assert send(link) == [("t", 1, expected)]
+
+
+@pytest.mark.parametrize("keep", ["auto", "all", "latest"])
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("held", [False, True])
+def test_a_rule_with_qos_0_is_sent_with_qos_0(keep: KeepRule, restarted: bool, held: bool) -> None:
+    """An acknowledged message waits as the publisher's QoS says, and is settled when it is sent."""
+    link = Link(OutRule("#", "r/", "fleet/", keep, qos=0))
+    assert link.offer("1", "event") is None
+    assert link.offer("2", "event") is None
+    if held and keep != "latest":
+        for entry in link.take():
+            assert link.backlog.hold(entry, 10)
+        link.backlog.rewind()
+        link.backlog.connected()
+    link.backlogs.commit()
+    if restarted:
+        link.restart()
+    assert send(link) == [("event", 0, None)] * (1 if keep == "latest" else 2)
+    assert link.counts().waiting == 0
+
+
+def test_a_rule_in_memory_with_qos_0_is_sent_with_qos_0() -> None:
+    link = Link(OutRule("#", "r/", "fleet/", "none", qos=0))
+    link.offer("1")
+    assert send(link) == [("t", 0, None)]
