@@ -354,6 +354,57 @@ async def test_a_fault_before_records_are_taken_is_an_outcome(
     escaped.clear()
 
 
+async def _single(harness: Harness, key: int) -> list[bytes] | Exception:
+    outcome: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+    harness.store.backlogs.single("fleet").read(key, outcome.set_result)
+    assert not outcome.done()
+    return await asyncio.wait_for(outcome, 30)  # type: ignore[no-any-return]
+
+
+async def test_records_that_are_read_one_by_one(harness: Harness, tmp_path: Path) -> None:
+    records = harness.store.backlogs.single("fleet")
+    found = [records.put(bytes([number]) * 1000) for number in range(5)]
+    assert await _single(harness, found[1]) == [b"\1" * 1000]  # not committed
+    records.remove(found[0])
+    await harness.written()
+    assert not records._uncommitted
+    records.remove(found[1])
+    records.remove(found[1])
+    for key in found[:2]:
+        assert await _single(harness, key) == []
+    assert await _single(harness, found[2]) == [b"\2" * 1000]
+    later = records.put(b"x" * 1000, awaited=False)
+    await harness.written()
+    assert keys(harness, "backlog") == keys(harness, "segment") == [*found[2:], later]
+    twin = harness.twin(tmp_path / "twin")  # as after a kill
+    again = twin.store.backlogs.single("fleet")
+    assert again.load() == [*found[2:], later]
+    assert await _single(twin, found[3]) == [b"\3" * 1000]
+    assert await _single(twin, later) == [b"x" * 1000]
+    assert twin.store.backlogs.links() == ["fleet"]
+    assert not twin.store.backlogs.journal("fleet", 0).segments()
+    twin.store.backlogs.forget("fleet")
+    await twin.written()
+    assert not again.load() and not keys(twin, "backlog") and not keys(twin, "segment")
+    await twin.stop()
+
+
+async def test_a_damaged_record_that_is_read_by_itself_is_reported(
+    harness: Harness, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    records = harness.store.backlogs.single("fleet")
+    found = [records.put(text * 1000) for text in (b"1", b"2")]
+    await harness.stop()
+    _spoil(harness.path, b"1" * 1000, b"x" * 1000)
+    again = Harness(tmp_path / "first").start()
+    assert isinstance(await _single(again, found[0]), RecordsLostError)
+    assert await _single(again, found[1]) == [b"2" * 1000]
+    assert await _single(again, found[0]) == []
+    assert again.store.backlogs.single("fleet").load() == found[1:]
+    assert "IS DAMAGED: a message for fleet" in caplog.text
+    await again.stop()
+
+
 async def test_what_waits_is_shown_and_pruned(harness: Harness) -> None:
     for lane in range(2):
         for number in range(10):

@@ -96,6 +96,18 @@ def test_lanes_and_links_are_apart() -> None:
     backlogs.latest("c").remove(key)
     assert backlogs.links() == ["b"]
     assert not backlogs.failing
+    single = backlogs.single("e")
+    one, two = single.put(b"one"), single.put(b"two")
+    assert single.load() == [one, two] and backlogs.links() == ["b", "e"]
+    read: list[object] = []
+    single.read(two, read.append)
+    single.remove(one)
+    single.read(one, read.append)
+    while memory.rounds:
+        memory.rounds.popleft()()
+    assert read == [[b"two"], []]
+    backlogs.forget("e")
+    assert backlogs.links() == ["b"]
 
 
 async def test_a_fault_of_the_reader_is_contained(escaped: list[str]) -> None:
