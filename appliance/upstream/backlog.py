@@ -7,14 +7,25 @@ of them is next, what is dropped when the backlog is full, and what is in memory
 - messages that were handed out, at most `IN_FLIGHT_SIZE` bytes;
 - the next ones of each journal, `LOADED_SIZE` for all rules; the others are on disk alone;
 - the latest ones of topics, `LATEST_SIZE`, and with those that are forgotten when the connection
-  ends, `LIVE_SIZE`. A latest one that has no room there is in its rule's journal, and dropped from
-  there when a newer one of its topic has come; what is in memory of it is its topic, see
-  `Overflow`.
+  ends, `LIVE_SIZE`, each for the link as a whole. A latest one that has no room there is only on
+  disk, by itself, and its topic is in memory, `TOPICS_SIZE`.
 
 A single message may exceed each of these, as it could not be sent otherwise.
 
+Of a rule, messages of which all count are in its journal, and nothing else is. What counts as the
+latest one of its topic is in its `LatestValues`, and replaced there. So this holds, over any
+sequence of offers, hand-outs, rewinds, acknowledgements and restarts:
+
+- Many messages of a `latest` topic take the room of one. An acknowledged message of which all count
+  is dropped only as `size` and `age` say: too old, then the lowest lane, in it the oldest.
+- Of the latest messages of a topic, the last that is sent is the newest: at most one waits or was
+  put back, and whatever else of the topic was handed out ends with the connection.
+- Of a topic that has both, QoS 1 and above keep their order. A latest one is `blocked` while older
+  records wait in the journal, and goes before the first newer record of its topic there.
+
 What is larger than the fleet's broker takes on this connection moves to a queue of its own, `HELD`,
-and is handed out once on each connection that takes more than the largest before.
+of at most `MOST_HELD` messages and `HELD_SHARE` of the size. They are handed out once on each
+connection that takes more than that on which the least of them was too large.
 
 Each message that was offered is in the end sent, dropped for a reason, or set aside:
 `offered + restored = sent + dropped + set aside + waiting`, see `BacklogCounts`.

@@ -9,6 +9,7 @@ import pytest
 
 from appliance.broker.ports import RecordsLostError
 from appliance.mqtt.codec import NO_PROPERTIES
+from appliance.upstream import backlog as module
 from appliance.upstream.backlog import MOST_LATER, Backlog, BacklogCounts, DropReason
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
@@ -756,3 +757,149 @@ def test_many_at_once_leave_out_what_was_replaced_or_is_held() -> None:
             found.append(entry.record.payload.decode().rstrip())
             link.backlog.settle(entry)
     assert [each for each in found if each != "x"] == ["new"]
+
+
+def test_what_too_many_are_too_large_for_is_not_kept() -> None:
+    """Such messages do not fill the backlog: the others have room."""
+    link = Link(size=40_000, when_full="refuse")
+    link.backlog.connected(100)
+    held = 0
+    for _ in range(100):
+        assert link.offer("x" * 900) is None
+        entry = link.next()
+        assert entry is not None
+        if link.backlog.hold(entry, 100):
+            held += 1
+        else:
+            link.backlog.set_aside(entry, "too large", link.backlogs.time)
+    assert held == link.counts().held == 10
+    assert link.counts().set_aside == 90
+
+
+def test_what_is_too_large_is_tried_on_each_connection_that_takes_more() -> None:
+    link = Link(online=False)
+
+    def visit(limit: int, most: int = 100) -> list[int]:
+        link.backlog.connected(limit)
+        sent: list[int] = []
+        while most and (entry := link.next()) is not None:
+            most -= 1
+            size = len(entry.record.payload)
+            if size > limit:
+                assert link.backlog.hold(entry, limit)
+            else:
+                sent.append(size)
+                link.backlog.settle(entry)
+        link.backlog.rewind()
+        return sent
+
+    link.offer("x" * 3000)
+    assert visit(2000) == []
+    link.offer("x" * 600)
+    assert visit(500) == []  # another server
+    assert visit(2000) == [600]
+    assert visit(2000) == [] and link.counts().held == 1
+    link.offer("x" * 600)
+    link.offer("x" * 700)
+    assert visit(500) == []
+    assert visit(1000, most=2) == [600]  # the connection ends before all were tried
+    assert visit(1000) == [700]
+    assert visit(3000) == [3000]
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("topics", [1, 20_000])
+def test_states_do_not_drop_events(restarted: bool, topics: int) -> None:
+    """Of one rule, while the link is down: of the states one a topic waits."""
+    size = 1 << 20 if topics == 1 else 24 << 20
+    link = Link(online=False, size=size)
+    link.offer("0", "event")
+    link.backlogs.commit()
+    if restarted:
+        link.restart()
+        link.backlog.rewind()
+    for number in range(2 * topics + 20_000):
+        retain = number % 4 == 0
+        link.offer(f"{number}".ljust(200), f"state/{number % topics}", retain, retain=retain)
+        if number % 100 == 0:
+            link.offer(f"{number}", "event")
+        if number % 5000 == 0:
+            link.backlogs.commit()
+    events = 1 + len(range(0, 2 * topics + 20_000, 100))
+    assert set(link.dropped()) == {"replaced"}
+    assert link.counts().waiting == topics + events
+    link.backlog.connected()
+    sent: list[tuple[str, str]] = []
+    while (entry := link.next()) is not None:
+        sent.append((entry.record.topic, entry.record.payload.decode().rstrip()))
+        link.backlog.settle(entry)
+    assert len([text for topic, text in sent if topic == "event"]) == events
+    if topics > 1:
+        last = {topic: int(text) for topic, text in sent}
+        del last["event"]
+        assert sorted(last.values()) == list(range(topics + 20_000, 2 * topics + 20_000))
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("qos", [0, 1])
+def test_what_memory_had_no_room_for_does_not_come_back_after_a_newer_one(
+    restarted: bool, qos: int
+) -> None:
+    link = Link(rule(keep="latest"), online=False)
+    for number in range(12):
+        link.offer("x".ljust(500_000), f"big{number}", qos)
+    link.offer("old".ljust(500_000), "t", qos)
+    link.backlogs.commit()
+    if restarted:
+        link.restart()
+    link.backlog.connected()
+    flying = link.take()
+    for entry in flying:
+        if entry.record.topic != "t":
+            link.backlog.settle(entry)
+    flying += link.take()
+    assert "t" in [entry.record.topic for entry in flying]
+    link.offer("new", "t", qos)
+    link.backlog.rewind()
+    link.backlog.connected()
+    assert [each for each in link.drain() if each[0] != "x"] == ["new"]
+    assert not link.backlogs.single_records.rows
+
+
+def test_more_topics_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest of the lowest lane go, of all rules of the link; or the publisher is told."""
+    monkeypatch.setattr(module, "LATEST_SIZE", 5_000)
+    monkeypatch.setattr(module, "TOPICS_SIZE", 10_000)
+    rules = rule(keep="latest"), rule("b", keep="latest"), rule("h", "latest", "high")
+    link = Link(*rules, online=False)
+    for number in range(100):
+        link.offer(f"{number}", f"t{number}", of=number % 2)
+    link.offer("high", "high", of=2)
+    waiting = link.counts().waiting
+    assert 15 < waiting < 30 and link.dropped() == {"full": 101 - waiting}
+    expected = {"high", *(f"{number}" for number in range(101 - waiting, 100))}
+    assert set(link.drain()) == expected
+    link = Link(*rules, online=False, when_full="refuse")
+    told = [link.offer(f"{number}", f"t{number}", of=number % 2) for number in range(100)]
+    assert told.index(next(each for each in told if each)) == waiting
+    assert link.counts().waiting == waiting
+
+
+def test_a_value_that_cannot_be_read_is_read_again_and_a_damaged_one_is_counted(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    link = Link(rule(keep="latest"), online=False)
+    for number in range(8):
+        link.offer(f"{number}".ljust(900_000), f"t{number}")
+    assert len(link.backlogs.single_records.rows) == 5
+    link.backlogs.failures.extend([OSError("disk"), RecordsLostError("damaged")])
+    link.backlog.connected()
+    sent = link.drain()
+    assert len(sent) == 3
+    due = link.backlog.due(link.backlogs.time)
+    assert due is not None
+    link.backlogs.time = due
+    sent += link.drain()
+    assert len(sent) == 7 and link.dropped() == {"unreadable": 1}
+    assert "cannot be read: disk" in caplog.text
+    assert not link.backlogs.single_records.rows

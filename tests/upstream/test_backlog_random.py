@@ -81,6 +81,8 @@ class Twin:
         self.later: dict[Entry, Sent] = {}
         self.online = True
         self.serial = 0
+        #: Values that memory had no room for.
+        self.on_disk = 0
         self.seen_drops: dict[tuple[str, DropReason], int] = {}
         #: By rule and topic: the newest message handed out that counts as the latest one.
         self.newest: dict[tuple[int, str], int] = {}
@@ -117,14 +119,7 @@ class Twin:
         self.take_drops(but=sent)
         if sent.size < 0:
             return
-        if kind == "latest" and qos and self.may_be_stored(of, topic):
-            kind = sent.kind = "all"
         if kind == "all":
-            before = waiting.latest.get(topic)
-            if before is not None and before.qos:
-                del waiting.latest[topic]
-                before.kind = "all"
-                waiting.all.append(before)
             waiting.all.append(sent)
             sent.is_stored = True
         elif kind == "latest":
@@ -146,6 +141,10 @@ class Twin:
                     del self.later[entry]
                     self.expect(of, DropReason.REPLACED)
             waiting.latest[topic] = sent
+            value = self.link.backlog._queues[self.rules[of].local_filter].latest.get(topic)
+            assert value is not None and (value.key is not None or not sent.is_stored)
+            sent.is_stored = value.key is not None  # also where memory has no room for it
+            self.on_disk += value.single is not None
         else:
             waiting.live.append(sent)
 
@@ -153,13 +152,6 @@ class Twin:
         """What was handed out of a rule, in the order of its publication."""
         found = [*self.flying.values(), *self.later.values(), *self.waiting[of].again]
         return sorted((each for each in found if each.of == of), key=lambda each: int(each.name))
-
-    def may_be_stored(self, of: int, topic: str) -> bool:
-        """Whether older messages of the topic are in the journal; the backlog knows about that."""
-        return self.link.backlog._queues[self.rules[of].local_filter].may_store(topic) or any(
-            each.topic == topic and each.kind == "all" and not each.retried
-            for each in (*self.waiting[of].all, *self.unsettled(of))
-        )
 
     def next(self) -> None:
         entry = self.link.next()
@@ -181,7 +173,7 @@ class Twin:
             of = [each.local_filter for each in self.rules].index(entry.record.rule)
             waiting = self.waiting[of]
             self.take_drops()
-            heads = {each.name: each for each in waiting.first()}
+            heads = {each.name: each for each in [*waiting.first(), *waiting.latest.values()]}
             assert name in heads, (name, heads)
             sent = heads[name]
             for queue in (waiting.again, waiting.all, waiting.live):
@@ -189,6 +181,13 @@ class Twin:
                     del queue[0]
             if waiting.latest.get(sent.topic) is sent:
                 del waiting.latest[sent.topic]
+            for each in (*waiting.again, *waiting.all, *waiting.latest.values()):
+                if each.topic == sent.topic and each.qos and sent.qos and not each.retried:
+                    assert int(each.name) > int(sent.name), "an older one of its topic waits"
+        if sent.kind == "latest":
+            # Whatever came in between: nothing follows that is older than what was sent.
+            assert int(sent.name) >= self.newest.get((sent.of, sent.topic), 0)
+            assert entry.qos == (1 if sent.retain else min(1, sent.qos))
         record = entry.record
         assert (record.topic, record.qos, record.retain) == (sent.topic, sent.qos, sent.retain)
         assert record.expires_at == sent.expires_at
@@ -265,6 +264,23 @@ class Twin:
         self.link.backlogs.commit()
         self.revived.clear()
         self.committed = {each.name for each in self.every() if each.is_stored}
+
+    def restart(self) -> None:
+        """The appliance stops in peace. What was handed out is settled: otherwise it is repeated
+        with what was settled behind it."""
+        if self.later or any(waiting.again for waiting in self.waiting):
+            return
+        while self.flying:
+            self.settle()
+        self.commit()
+        self.link.restart()
+        self.online = True
+        self.seen_drops.clear()
+        for waiting in self.waiting:
+            waiting.live.clear()
+            kept = [each for each in waiting.latest.values() if each.is_stored]
+            kept.sort(key=lambda each: int(each.name))
+            waiting.latest = {each.topic: each for each in kept}
 
     def merge(self) -> None:
         for journal in self.link.backlogs.journals.values():
@@ -392,7 +408,7 @@ class Twin:
 
 
 OPERATIONS = ["offer"] * 12 + ["next"] * 10 + ["settle"] * 8 + ["commit", "merge", "rewind"]
-OPERATIONS += ["connect", "connect", "wait", "retry", "aside"]
+OPERATIONS += ["connect", "connect", "wait", "retry", "aside", "restart", "restart"]
 
 
 @pytest.fixture
@@ -400,6 +416,8 @@ def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most of what waits is only on disk."""
     monkeypatch.setattr(module, "LOADED_SIZE", 1500)
     monkeypatch.setattr(module, "LOADED_SHARE", 300)
+    monkeypatch.setattr(module, "LATEST_SIZE", 1200)
+    monkeypatch.setattr(module, "VALUES_SIZE", 300)
 
 
 def _compare(twin: Twin, seed: int, operations: list[str]) -> None:
@@ -408,6 +426,7 @@ def _compare(twin: Twin, seed: int, operations: list[str]) -> None:
         if operation != "next" or twin.online:
             getattr(twin, operation)()
             twin.check()
+    assert twin.on_disk
     if seed % 2:
         twin.drain()
     else:
