@@ -52,7 +52,7 @@ deb: binary
 	@$(BIN)/python -m appliance.packaging.deb dist/appliance
 
 .venv/run.stamp: pyproject.toml constraints.txt
-	@echo "Setting up .venv; the first time this takes a minute."
+	@echo "Setting up .venv; the first time this takes a minute or two."
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV_OPTIONS) .venv
 	@$(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt -e '.$(RUN_EXTRAS)'
 	@touch $@
