@@ -342,6 +342,19 @@ async def byte_by_byte(visit: Visit) -> None:
 # Behind CONNACK
 
 
+@scenario("connack", "returns")
+def disconnect_in_one_segment_with_connack(visit: Visit) -> None:
+    """DISCONNECT comes in the same segment as CONNACK: what is asked then has no connection."""
+    visit.send(Connack(False, 0), Disconnect(0x8B))
+    visit.close()
+
+
+@scenario("suback", "returns")
+def fin_in_place_of_suback(visit: Visit) -> None:
+    """The connection is closed after SUBSCRIBE."""
+    visit.close()
+
+
 @scenario("connected", "ends")
 def connack_twice(visit: Visit) -> None:
     """CONNACK comes once more."""
