@@ -387,6 +387,7 @@ class Twin:
         assert not any(journal.list for journal in self.link.backlogs.journals.values())
         rows = self.link.backlogs.latest_records.rows.values()
         assert [row for row in rows if row[:1] != b"N"] == []
+        assert not self.link.backlogs.single_records.rows
 
     def kill(self) -> None:
         """What was committed is there, in order; nothing else but what a commit did not take."""
@@ -443,6 +444,40 @@ def test_like_a_list(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_like_a_full_list(seed: int) -> None:
     _compare(Twin(seed, PLAIN, size=4_000), seed, OPERATIONS + ["offer"] * 10)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_too_large_for_one_server_goes_to_another(seed: int) -> None:
+    """On a connection that is not cut short all that is not too large for it is sent."""
+    choose = random.Random(seed)
+    link = Link(rule("a"), rule("b", priority="low"), online=False)
+    waiting: list[int] = []
+    for _ in range(100):
+        for _ in range(choose.randrange(4)):
+            size = choose.randrange(1, 50)
+            waiting.append(size)
+            link.offer("x" * size, of=choose.randrange(2))
+        if choose.random() < 0.1:
+            link.backlogs.commit()
+            link.restart()
+        limit, left = choose.choice([5, 10, 20, 30, 40]), choose.choice([0, 3, 1000, 1000])
+        link.backlog.connected(limit)
+        while left and (entry := link.next()) is not None:
+            left -= 1
+            size = len(entry.record.payload)
+            if size <= limit:
+                waiting.remove(size)
+                link.backlog.settle(entry)
+            elif choose.random() < 0.9:
+                assert link.backlog.hold(entry, limit)
+            else:
+                left = 0  # the connection ends before
+        link.backlog.rewind()
+        if left:
+            assert not waiting or min(waiting) > limit
+        assert link.counts().waiting == len(waiting)
+    link.backlog.connected(50)
+    assert len(link.drain()) == len(waiting)
 
 
 # Several at once, against one by one.
