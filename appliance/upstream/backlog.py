@@ -613,8 +613,9 @@ class Backlog:
         before = queue.newest.get(topic)
         if before is None:
             return None, None
-        key, single = before.key, before.single
-        before.key = before.single = None
+        assert before.value is not None
+        key, single = before.key, before.value.single
+        before.key = before.value.single = None
         if before.state in (AGAIN, LATER):
             self._discard(before, DropReason.REPLACED)
         return key, single
@@ -1191,8 +1192,8 @@ class Backlog:
         self._free_latest(queue, value)
         entry = Entry(queue, record, value.size)
         entry.key = value.key
-        entry.single = value.single
-        entry.topic = value.topic
+        entry.value = value
+        value.data = None
         queue.newest[value.topic] = entry
         if not record.retain:
             entry.qos = min(queue.qos, record.qos)
@@ -1486,8 +1487,8 @@ class Backlog:
             queue.settle(part, entry.index)
             self._check_emptied(queue)
         if entry.key is not None:
-            self._remove_rows(entry.key, entry.single)
-            entry.key = entry.single = None
+            self._remove_rows(entry.key, None if entry.value is None else entry.value.single)
+            entry.key = None
         if entry.topic is not None and queue.newest.get(entry.topic) is entry:
             del queue.newest[entry.topic]
 

@@ -74,10 +74,9 @@ class Entry:
         "qos",
         "queue",
         "record",
-        "single",
         "size",
         "state",
-        "topic",
+        "value",
     )
 
     def __init__(self, queue: RuleQueue, record: Record, size: int) -> None:
@@ -90,14 +89,17 @@ class Entry:
         self.published_at: float | None = None
         self.attempts = 0
         self.state = IN_FLIGHT
-        #: Where it is stored: in the journal, as a row of its own, or not at all. Of a row the
-        #: record may be apart, by the key `single`.
+        #: Where it is stored: in the journal, as a row of its own, or not at all.
         self.part: HeldSegment | None = None
         self.index = 0
         self.key: int | None = None
-        self.single: int | None = None
-        #: Its topic, when it counts only as long as it is the latest one of it.
-        self.topic: str | None = None
+        #: What it was before, when it counts only as long as it is the latest one of its topic.
+        self.value: LatestValue | None = None
+
+    @property
+    def topic(self) -> str | None:
+        """Its topic, when it counts only as long as it is the latest one of it."""
+        return None if self.value is None else self.value.topic
 
 
 class RuleQueue:
