@@ -46,27 +46,34 @@ class Links:
                 continue
             # It takes what is published until it has ended, and the next one begins at once:
             # nothing is published between them.
-            await uplink.stop(is_removed=link is None)
+            client_id = uplink.settings.client_id
+            is_named = any(each.client_id == client_id for each in wanted.values())
+            await uplink.stop(is_last=link is None, is_named=is_named)
             self.running.remove(uplink)
             changed.append(f"{uplink} is {'removed' if link is None else 'started anew'}")
             if link is not None:
-                self._start(link)
+                self._start_contained(link, uplink)
         running = {uplink.settings.name for uplink in self.running}
         for name, link in wanted.items():
             if name not in running:
-                self._start(link)
+                self._start_contained(link)
                 changed.append(f"upstream '{name}' is new")
-        order = list(wanted)
-        self.running.sort(key=lambda uplink: order.index(uplink.settings.name))
+        if not self._is_stopped:  # else there may be others than the wanted ones
+            order = list(wanted)
+            self.running.sort(key=lambda uplink: order.index(uplink.settings.name))
         return changed
 
-    def _start(self, link: UpstreamSettings) -> None:
+    def _start_contained(self, link: UpstreamSettings, before: Uplink | None = None) -> None:
+        """A fault of one link keeps no other one from its start."""
+        self._entries.run("upstream.start", link.name, None, self._start, (link, before))
+
+    def _start(self, link: UpstreamSettings, before: Uplink | None = None) -> None:
         from appliance.upstream.uplink import Uplink, UplinkParts
 
         if self._is_stopped:
             return
         parts = UplinkParts(self._broker, self._entries, self._backlogs, self._scheduler)
-        uplink = Uplink(link, parts)
+        uplink = Uplink(link, parts, before)
         uplink.start()
         self.running.append(uplink)
 

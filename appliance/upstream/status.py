@@ -14,8 +14,9 @@ class LinkStatus:
     `problem` is why it is not connected, or what is wrong although it is. `waiting` messages are
     not acknowledged by the fleet's broker yet; the oldest is `oldest` seconds old. `dropped` is by
     rule and reason, both ways. Of what came, `held_back` messages wait for their receivers here,
-    and `unacknowledged` ones are not acknowledged to the fleet's broker. `refused_filters` are of
-    subscriptions that it refuses, `missing_filters` of those upon which it closes the connection.
+    and `unacknowledged` ones are not acknowledged to the fleet's broker. `forgotten` ones
+    were lost at reloads. `refused_filters` are of subscriptions that it refuses, `missing_filters`
+    of those upon which it closes the connection.
     """
 
     name: str
@@ -46,6 +47,7 @@ class LinkStatus:
     dropped: dict[str, dict[str, int]] = field(default_factory=dict)
     set_aside: int = 0
     too_large: int = 0
+    forgotten: int = 0
     refused_filters: list[str] = field(default_factory=list)
     missing_filters: list[str] = field(default_factory=list)
     denied: dict[str, str] = field(default_factory=dict)
@@ -75,6 +77,11 @@ def warnings_of(status: dict[str, Any]) -> Iterator[str]:
         yield (
             "messages that are larger than the fleet's broker takes now (Maximum Packet Size) wait "
             f"until it takes more: {status['too_large']}"
+        )
+    if status["forgotten"]:
+        yield (
+            "messages of QoS 0 that waited in memory were lost when its section was reloaded: "
+            f"{status['forgotten']}"
         )
     if status["set_aside"]:
         yield f"messages that the fleet's broker never takes were set aside: {status['set_aside']}"

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -75,7 +77,10 @@ class UplinkParts:
 class Uplink:
     """One link; on the event loop's thread."""
 
-    def __init__(self, settings: UpstreamSettings, parts: UplinkParts) -> None:
+    def __init__(
+        self, settings: UpstreamSettings, parts: UplinkParts, before: Uplink | None = None
+    ) -> None:
+        """`before` is the stopped link of the same name that this one follows."""
         self.settings = settings
         self.broker = parts.broker
         self.entries = parts.entries
@@ -83,7 +88,10 @@ class Uplink:
         self._loop = parts.entries.loop
         self._rules = LinkRules(settings)
         self._presence = presence_messages(settings)
+        # Who waits for an answer to a call under way waits for one from this link.
         self._answers = Answers(settings)
+        if before is not None and before._answer_topics == self._answer_topics:
+            self._answers = before._answers
         self._journal_clock = parts.backlogs.journal(settings.name, 0).now
         limits = KINDS[settings.kind]
         rate, size = limits.rates(settings.rate, settings.bytes_per_second)
@@ -93,10 +101,15 @@ class Uplink:
             (*settings.out, self._rules.answers),
             settings.backlog,
             self._journal_clock(),
-            self._wake,
+            _weakly(self._wake),
             rate=rate,
             bytes_per_second=size,
         )
+        #: Messages of QoS 0 that the link before had in memory.
+        self._forgotten = 0
+        if before is not None:
+            waiting = before._backlog.counts().waiting - self._backlog.counts().waiting
+            self._forgotten = before._forgotten + max(0, waiting)
         self._sender = Sender(settings.name, self._backlog, self._journal_clock, limits)
         self._out = OutSession(
             self.broker,
@@ -105,13 +118,15 @@ class Uplink:
             self._answers,
             self._backlog,
             self._journal_clock,
-            self._offer_later,
+            _weakly(self._offer_later),
         )
         self._in_counters = InCounters()
         self._readiness = Readiness()
-        self._lines = [Line(self, is_kept=False)]
+        # It is owned by nothing else than who has made it: see `app/main.py`, cycles are not freed.
+        link = weakref.proxy(self)
+        self._lines = [Line(link, is_kept=False)]
         if any(rule.offline == "keep" for rule in settings.inward):
-            self._lines.append(Line(self, is_kept=True))
+            self._lines.append(Line(link, is_kept=True))
         self._offered, self._sent = Meter(), Meter()
         #: On the present connection: whether the state is still to be published there, and whether
         #: the broker has answered that.
@@ -127,6 +142,10 @@ class Uplink:
     def __str__(self) -> str:
         return f"upstream '{self.settings.name}'"
 
+    @property
+    def _answer_topics(self) -> tuple[str, str]:
+        return self.settings.answers_here, self.settings.answers_there
+
     # --- its life ------------------------------------------------------------------------------
 
     def start(self) -> None:
@@ -139,10 +158,11 @@ class Uplink:
             line.start()
         self._report()
 
-    async def stop(self, *, is_removed: bool = False) -> None:
+    async def stop(self, *, is_last: bool = False, is_named: bool = True) -> None:
         """Say that the robot is offline, and disconnect; what waits stays in the backlog.
 
-        Of one that `is_removed` from the configuration nothing stays retained here.
+        Its status stays retained here, unless it `is_last` of this name, and the state of its
+        client id unless no other link `is_named` so.
         """
         if self._clock is not None:
             self._clock.cancel()
@@ -150,9 +170,10 @@ class Uplink:
         for timer in (self._send_timer, self._offer_timer):
             if timer is not None:
                 timer.cancel()
+        self._clock = self._send_timer = self._offer_timer = None
         self._report()
-        if is_removed:
-            self._publish_here(b"", b"")
+        if is_last or not is_named:
+            self._publish_here(b"" if is_last else self._reported, b"" if not is_named else b"0")
         self._out.detach()
         self.broker.flush()
 
@@ -428,6 +449,7 @@ class Uplink:
         status.set_aside, status.too_large = counts.aside, counts.held
         status.refused_filters = [each for line in self._lines for each in line.refused_filters]
         status.missing_filters = [each for line in self._lines for each in line.missing_filters]
+        status.forgotten = self._forgotten
         status.denied = dict(self._out.denied)
         status.advice = bottleneck(status)
         return status
@@ -469,3 +491,15 @@ class Uplink:
         self.broker.publish(Message(about[0], status, 0, True, _JSON), session)
         self.broker.publish(Message(about[1], state, 0, True), session)
         self.broker.flush()
+
+
+def _weakly(method: Callable[[], None]) -> Callable[[], None]:
+    """Calls the method as long as its object is there; does not keep that."""
+    found = weakref.WeakMethod(method)
+
+    def call() -> None:
+        bound = found()
+        if bound is not None:
+            bound()
+
+    return call

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,11 @@ import pytest
 import yaml
 from waiting import until
 
+from appliance import config
 from appliance.app.reload import ReloadError
+from appliance.mqtt.packets import Publish
+from appliance.upstream.status import warnings_of
+from appliance.upstream.uplink import Uplink
 from upstream.fake_fleet import FakeFleet
 from upstream.test_uplink import event_loop_policy, payloads, publish
 from upstream.uplink_rig import Rig, running
@@ -84,3 +90,74 @@ async def test_what_is_published_while_a_link_is_reloaded_is_not_lost(tmp_path: 
             await until(lambda: set(payloads(fleet, door)) == set(sent))
             assert list(dict.fromkeys(payloads(fleet, door))) == sent
             assert not fleet.faults
+
+
+async def test_what_a_reload_loses_is_counted_and_the_link_before_is_freed(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet:
+        rig = Rig(tmp_path, fleet.port)
+        (link,) = yaml.safe_load(rig.file.read_text())["upstreams"]
+        async with running(rig):
+            await rig.connected()
+            await fleet.stop()
+            await publish(rig, "r2d2/events/door", b"1", b"2")
+            peer = await rig.client("publisher")
+            for number in range(3):
+                await peer.send(Publish(f"r2d2/state/{number}", b"x", 0))
+            await until(lambda: rig.status().waiting == 5)
+            gc.collect()
+            gc.disable()
+            try:
+                before = weakref.ref(rig.uplink)
+                answers = rig.uplink._answers
+                await reload(rig, {**link, "keep_alive": "20 s"})
+                await until(lambda: before() is None, "the link before to be freed")
+            finally:
+                gc.enable()
+            assert rig.status().waiting == 2 and rig.status().forgotten == 3
+            assert any("3" in each for each in warnings_of(rig.status().as_json()))
+            assert rig.uplink._answers is answers
+            state = "$SYS/broker/connection/{}/state".format
+            assert rig.app.broker.retained.get(state("r2d2")) is not None
+            await reload(rig, {**link, "client_id": "other"})
+            assert rig.app.broker.retained.get(state("r2d2")) is None
+            assert rig.app.broker.retained.get(state("other")) is not None
+            assert rig.app.broker.retained.get("r2d2/_appliance/upstream/fleet") is not None
+            peer.hang_up()
+
+
+async def test_a_stop_within_a_reload_is_a_stop(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet:
+        rig = Rig(tmp_path, fleet.port)
+        (link,) = yaml.safe_load(rig.file.read_text())["upstreams"]
+        await rig.start()
+        a, b, c = ({**link, "name": each, "client_id": each} for each in "abc")
+        await reload(rig, a, b)
+        data = yaml.safe_load(rig.file.read_text())
+        rig.file.write_text(yaml.safe_dump({**data, "upstreams": [c]}))
+        links = rig.app._links
+        reloading = rig.app._entries.loop.create_task(links.replace(config.load(rig.file)))
+        await rig.app.stop()
+        await reloading
+        assert "c" not in [each.settings.name for each in links.running]
+
+
+async def test_a_link_that_cannot_start_keeps_no_other_one_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, escaped: list[str]
+) -> None:
+    async with FakeFleet() as fleet:
+        rig = Rig(tmp_path, fleet.port)
+        (link,) = yaml.safe_load(rig.file.read_text())["upstreams"]
+        async with running(rig):
+            start = Uplink.start
+
+            def failing(self: Uplink) -> None:
+                if self.settings.name == "bad":
+                    raise RuntimeError("bad")
+                start(self)
+
+            monkeypatch.setattr(Uplink, "start", failing)
+            bad, good = ({**link, "name": each, "client_id": each} for each in ("bad", "good"))
+            await reload(rig, bad, good)
+            await until(lambda: [each.settings.name for each in rig.app.upstreams] == ["good"])
+            assert rig.app.broker.faults.by_entry.pop("upstream.start") == 1
+    escaped.clear()
