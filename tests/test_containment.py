@@ -871,6 +871,7 @@ ELSEWHERE = {
     **dict.fromkeys(test_uplink_contained.ENTRIES, "upstream/test_uplink_contained.py"),
     **dict.fromkeys(test_dial.ENTRIES, "upstream/test_dial.py"),
     "upstream.return": "upstream/test_servers.py",
+    "upstream.start": "upstream/test_reload_links.py",
     "stop.session": "test_containment.py",
     "store.read": "store/test_memory_backlogs.py",
 }

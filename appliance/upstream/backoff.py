@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-#: The bounds of the longest wait: after the first failure, and after many.
-SHORTEST, LONGEST = 1.0, 60.0
+#: The bounds of the longest wait in seconds: after the first failure, and after many. All links of
+#: a fleet are to be connected within a minute of their broker's return: some of it is for that.
+SHORTEST, LONGEST = 1.0, 45.0
 
 #: Seconds that a connection lasts to count as a success, after which waits are short again.
 LASTED = 30.0
@@ -17,8 +18,9 @@ RETURN_AFTER = 300.0
 #: The longest time to the next return, when the ones before have failed.
 LONGEST_RETURN = 3600.0
 
-#: So many times in so many seconds another client took the client id over; then a wait of LONGEST.
+#: So many times in so many seconds another client took the client id over; then a wait of so many.
 TAKEN_OVER, TAKEN_OVER_WITHIN = 3, 60.0
+CONTESTED = 60.0
 
 
 class Backoff:
@@ -115,12 +117,12 @@ class Backoff:
     def taken_over(self, now: float) -> float:
         """Another client took the client id over (0x8E); returns the seconds until the next dial.
 
-        It is LONGEST when that happens again and again: two with the same client id would throw
+        It is CONTESTED when that happens again and again: two with the same client id would throw
         each other out for ever. Instead of `failed`.
         """
         self._connected_at = None
         self._took_over(now)
-        return LONGEST if self.is_contested(now) else self._random() * SHORTEST
+        return CONTESTED if self.is_contested(now) else self._random() * SHORTEST
 
     def closed(self, now: float) -> float:
         """The server has closed the connection for no reason that is known; instead of `failed`.
@@ -133,7 +135,7 @@ class Backoff:
             self._took_over(now)
         is_contested = not lasted and self.is_contested(now)
         wait = self.failed(now)
-        return LONGEST if is_contested else wait
+        return CONTESTED if is_contested else wait
 
     def _took_over(self, now: float) -> None:
         self._taken_over.append(now)

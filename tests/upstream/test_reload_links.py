@@ -141,6 +141,7 @@ async def test_a_stop_within_a_reload_is_a_stop(tmp_path: Path) -> None:
         assert "c" not in [each.settings.name for each in links.running]
 
 
+@pytest.mark.patches
 async def test_a_link_that_cannot_start_keeps_no_other_one_from_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, escaped: list[str]
 ) -> None:

@@ -100,4 +100,5 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     """Dial again soon."""
     monkeypatch.setattr(backoff, "SHORTEST", 0.05)
     monkeypatch.setattr(backoff, "LONGEST", 0.1)
+    monkeypatch.setattr(backoff, "CONTESTED", 0.1)
     monkeypatch.setattr(app_module, "TICK", 0.1)
