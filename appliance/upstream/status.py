@@ -17,6 +17,7 @@ class LinkStatus:
     and `unacknowledged` ones are not acknowledged to the fleet's broker. `forgotten` ones
     were lost at reloads. `refused_filters` are of subscriptions that it refuses, `missing_filters`
     of those upon which it closes the connection.
+    `state_refusal` is why the fleet does not see whether the robot is online.
     """
 
     name: str
@@ -51,6 +52,7 @@ class LinkStatus:
     refused_filters: list[str] = field(default_factory=list)
     missing_filters: list[str] = field(default_factory=list)
     denied: dict[str, str] = field(default_factory=dict)
+    state_refusal: str | None = None
     advice: str | None = None
 
     def as_json(self) -> dict[str, Any]:
@@ -62,6 +64,8 @@ def warnings_of(status: dict[str, Any]) -> Iterator[str]:
     """What a person should know of a link, from its status as JSON values."""
     if status["problem"]:
         yield status["problem"]
+    if status["state_refusal"]:
+        yield status["state_refusal"]
     if status["advice"]:
         yield status["advice"]
     for name, reason in status["denied"].items():

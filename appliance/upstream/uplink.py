@@ -132,6 +132,8 @@ class Uplink:
         #: the broker has answered that.
         self._state_due = False
         self._is_settled = False
+        #: Why the broker did not take it the last time.
+        self._state_refusal: str | None = None
         self._clock: PeriodicCallback | None = None
         self._send_timer: asyncio.TimerHandle | None = None
         self._send_at = 0.0
@@ -253,14 +255,13 @@ class Uplink:
         """See `ChannelOwner`."""
         if None in entries:  # the state
             self._is_settled = True
+            self._state_refusal = None
             if code >= 0x80:
-                log.warning(
-                    "%s: the fleet's broker refuses %s: %s; %s",
-                    self,
-                    quote(self.settings.state_there),
-                    reason_words(code),
-                    state_advice(code, self.settings),
+                self._state_refusal = (
+                    f"the fleet's broker refuses {quote(self.settings.state_there)}: "
+                    f"{reason_words(code)}; {state_advice(code, self.settings)}"
                 )
+                log.warning("%s: %s", self, self._state_refusal)
         self._sender.acknowledged(entries, code, reason)
 
     # --- the connections -----------------------------------------------------------------------
@@ -451,6 +452,7 @@ class Uplink:
         status.missing_filters = [each for line in self._lines for each in line.missing_filters]
         status.forgotten = self._forgotten
         status.denied = dict(self._out.denied)
+        status.state_refusal = self._state_refusal
         status.advice = bottleneck(status)
         return status
 

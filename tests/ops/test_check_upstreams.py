@@ -360,6 +360,15 @@ def test_rules_that_need_mqtt_5(here: Path) -> None:
             "their messages come twice",
         ),
         ({"out": [{"topic": "r2/events/#"}]}, "twice, as in r2/r2/events/#"),
+        ({"prefix": "fleet/r2/{robot}/"}, "prefix: the robot's name is in it twice: fleet/r2/r2/"),
+        (
+            {"out": [{"topic": "a", "remote_prefix": "x/{robot}/{robot}/"}]},
+            "out a: remote_prefix: the robot's name is in it twice: x/r2/r2/",
+        ),
+        (
+            {"in_": [{"topic": "a", "local_prefix": "{robot}/r2/"}]},
+            "in a: local_prefix: the robot's name is in it twice: r2/r2/",
+        ),
         ({"out": [{"topic": "_appliance/state"}]}, "no rule carries r2/_appliance/state"),
         ({"in_": [{"topic": "_appliance/x"}]}, "no rule carries fleet/r2/_appliance/x"),
         ({"out": [{"topic": "lamp", "local_prefix": "cell/"}]}, "nobody publishes cell/lamp here"),
@@ -375,6 +384,12 @@ def test_rules_that_cannot_do_what_they_say(here: Path, rules: dict[str, Any], w
         file.write("topic readwrite {robot}/#\ntopic readwrite cell/#\n")
     told = [each for each in troubles(here, **rules) if words in each]
     assert len(told) == 1
+
+
+def test_of_a_rule_that_names_the_robot_twice_only_that_is_said(here: Path) -> None:
+    rules = {"out": [{"topic": "r2/other/#"}], "in_": [{"topic": "r2/other", "late": None}]}
+    told = troubles(here, **rules)
+    assert [("leave out r2/" in each, "add to" in each) for each in told] == [(True, False)] * 2
 
 
 def test_rules_that_share_topics_in_a_useful_order(here: Path) -> None:

@@ -398,6 +398,22 @@ def test_what_ros_lost_is_told_with_what_to_do() -> None:
     assert not found["route /odom → r2/odom"].advice
 
 
+def test_a_link_that_does_not_work_is_a_problem_and_told_once() -> None:
+    links = [
+        {"name": "a", "connected": True, "problem": None},
+        {"name": "b", "connected": False, "problem": "refused"},
+        {"name": "c", "connected": False, "problem": None},
+    ]
+    warnings = ["upstream a: state", "upstream b: refused"]
+    told = {"version": "1", "pid": 1, "clients": 0, "warnings": warnings, "routes": {"sick": []}}
+    found = [(f.level, f.text) for f in examination._running({**told, "upstreams": links})][1:]
+    assert found == [
+        ("warning", "upstream a: state"),
+        ("error", "the running link is not connected: refused"),
+        ("error", "the running link is not connected: it is being dialled"),
+    ]
+
+
 def test_an_open_bus_is_warned_of(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (*ros._DISCOVERY, "ROS_SECURITY_ENABLE", *fastdds.VARIABLES):
         monkeypatch.setenv(name, "")  # what is set below is undone

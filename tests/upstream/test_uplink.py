@@ -23,6 +23,7 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream import channel as channel_module
 from appliance.upstream.sender import WITHOUT_PROGRESS
+from appliance.upstream.status import warnings_of
 from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
 from upstream.uplink_rig import Rig, hurry, running
@@ -131,6 +132,17 @@ async def test_online_and_offline_are_said_there_and_here(tmp_path: Path) -> Non
             assert state is not None and state.payload == b"1"
         assert payloads(fleet, "fleet/r2d2/_appliance/state") == [b"online", b"offline"]
         assert fleet.visit.disconnect is not None
+
+
+async def test_a_refused_state_is_told_until_the_fleet_takes_it(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        fleet.acknowledge = refuse(0x87, times=1)
+        await until(lambda: rig.status().state_refusal)
+        (text,) = warnings_of(rig.status().as_json())
+        assert "0x87 Not authorized; the fleet does not see that the robot is online" in text
+        fleet.acknowledge = accept
+        fleet.visit.close()
+        await until(lambda: rig.status().state_refusal is None)
 
 
 async def test_a_link_by_vda5050_says_so_in_its_messages(tmp_path: Path) -> None:

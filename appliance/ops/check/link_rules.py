@@ -34,6 +34,10 @@ def link_rules(settings: Settings, link: UpstreamSettings, acl: Acl | None) -> I
     """Findings about the rules of one link."""
     subject = f"upstream {link.name}"
     texts = [*_hidden("out", link.out), *_hidden("in", link.inward), *_twice(link.inward)]
+    if link.vehicle is None and _is_twice(link, link.prefix):  # a manufacturer may have that name
+        texts.append(
+            f"prefix: the robot's name is in it twice: {link.prefix}; leave out one of them"
+        )
     for direction, rules in (("out", link.out), ("in", link.inward)):
         for rule in rules:
             texts += _names_the_robot(link, direction, rule)
@@ -76,7 +80,25 @@ def _twice(rules: Sequence[InRule]) -> Iterator[str]:
                 )
 
 
+def names_the_robot(link: UpstreamSettings, rule: OutRule | InRule) -> bool:
+    """Whether the robot's name is in the rule's filters twice, so that they are not those meant."""
+    return bool(_names_the_robot(link, "", rule))
+
+
+def _is_twice(link: UpstreamSettings, prefix: str) -> bool:
+    return f"/{link.robot}/{link.robot}/" in f"/{prefix}"
+
+
 def _names_the_robot(link: UpstreamSettings, direction: str, rule: OutRule | InRule) -> list[str]:
+    prefixes = [("local_prefix", rule.local_prefix)]
+    if rule.remote_prefix != link.prefix:
+        prefixes.append(("remote_prefix", rule.remote_prefix))
+    for key, prefix in prefixes:
+        if _is_twice(link, prefix):
+            return [
+                f"{direction} {rule.topic}: {key}: the robot's name is in it twice: {prefix}; "
+                "leave out one of them"
+            ]
     first = rule.topic.partition("/")[0]
     doubled = [
         topic
@@ -129,6 +151,8 @@ def _without_publisher(
             if not route.is_exclusion and route.to != "ros":
                 published += command_filters(route, settings.robot)
     for out in link.out:
+        if names_the_robot(link, out):
+            continue  # which is said
         if any(level.startswith("_") for level in out.topic.split("/")):
             continue  # answers, feedback and states of calls
         if link.vehicle is not None and out.topic == "visualization":

@@ -17,7 +17,7 @@ from appliance.broker.ports import Action, Identity
 from appliance.config import Settings, TopicRoute, format_duration, format_size
 from appliance.mqtt.codec import V5, V311
 from appliance.mqtt.topics import overlaps
-from appliance.ops.check.link_rules import link_rules
+from appliance.ops.check.link_rules import link_rules, names_the_robot
 from appliance.ops.check.rights import written
 from appliance.ops.finding import Finding
 from appliance.ops.init import call_topics
@@ -249,12 +249,14 @@ def _rights(settings: Settings, link: UpstreamSettings, acl: Acl) -> Iterator[Fi
     lacking = [
         (f"out {rule.topic}", "read", rule.local_filter)
         for rule in link.out
-        if not acl.allows_some(reader, Action.RECEIVE, rule.local_filter)
+        if not names_the_robot(link, rule)
+        and not acl.allows_some(reader, Action.RECEIVE, rule.local_filter)
     ]
     lacking += [
         (f"in {rule.topic}", "write", rule.local_filter)
         for rule in link.inward
-        if not acl.allows_some(writers[rule.offline], Action.PUBLISH, rule.local_filter)
+        if not names_the_robot(link, rule)
+        and not acl.allows_some(writers[rule.offline], Action.PUBLISH, rule.local_filter)
     ]
     # Who calls names where to be answered, and may do so only where it may publish itself.
     answers = f"{link.answers_here}#"

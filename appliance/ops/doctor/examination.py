@@ -66,8 +66,20 @@ def examine(path: Path | None) -> Iterator[Finding]:
 def _running(status: dict[str, Any]) -> Iterator[Finding]:
     text = f"{status['version']} is running, pid {status['pid']}, {status['clients']} clients"
     yield Finding("ok", "appliance", text)
+    # Of a link that is not connected the status has the reason among the warnings.
+    broken = {
+        f"upstream {link['name']}: {link['problem']}": f"upstream {link['name']}"
+        for link in status.get("upstreams", ())
+        if link["problem"]
+    }
     for warning in status["warnings"]:
-        yield Finding("warning", "appliance", warning)
+        if warning not in broken:
+            yield Finding("warning", "appliance", warning)
+    for link in status.get("upstreams", ()):
+        if link["problem"] or not link["connected"]:
+            state = "has a problem" if link["connected"] else "is not connected"
+            why = link["problem"] or "it is being dialled"
+            yield Finding("error", f"upstream {link['name']}", f"the running link {state}: {why}")
     for sick in status["routes"]["sick"]:
         advice = LOST_IN_ROS if sick["lost"] else ""
         yield Finding("warning", f"route {sick['route']}", sick["problem"], advice)
