@@ -12,6 +12,7 @@ import contextlib
 import logging
 import math
 import random
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Protocol
@@ -49,6 +50,9 @@ AGAIN: Final = 1.0
 #: Seconds that the stop waits for a dial to be cancelled, at a time.
 CANCEL_TIMEOUT: Final = 2.0
 
+#: Reason codes of CONNACK that are about the will: the next CONNECT has another one.
+OF_WILL: Final = frozenset((ReasonCode.RETAIN_NOT_SUPPORTED, ReasonCode.QOS_NOT_SUPPORTED))
+
 #: Seconds in which both ends may acknowledge what is under way, before the connection is ended to
 #: go back to the first server. The rest is sent again there.
 LEAVING: Final = 5.0
@@ -66,9 +70,14 @@ class LineOwner(ChannelOwner, Protocol):
         """The client id that the connection asks for."""
 
     def connect_settings(
-        self, version: int, credentials: Credentials, *, is_kept: bool
+        self,
+        version: int,
+        credentials: Credentials,
+        *,
+        is_kept: bool,
+        refused: Collection[ReasonCode],
     ) -> ConnectSettings:
-        """What CONNECT asks for."""
+        """What CONNECT asks for; the broker has `refused` the will because of these."""
 
     def subscriptions(self, version: int, *, is_kept: bool) -> list[Subscription]:
         """What the connection subscribes to."""
@@ -110,6 +119,8 @@ class Line:
         self._loop = link.entries.loop
         self._versions = ServerVersions(link.settings.version)
         self._unanswered = [UnansweredFilters() for _ in link.settings.servers]
+        #: Why each server does not take the will as it was first.
+        self._will_refused: list[set[ReasonCode]] = [set() for _ in link.settings.servers]
         self._backoff = Backoff(len(link.settings.servers), random.random)
         self._ending: asyncio.Future[Ending] | None = None
         self._task: asyncio.Task[None] | None = None
@@ -221,7 +232,12 @@ class Line:
         subscriptions = [self._missing.pop(each) for each in unanswered.ask(list(self._missing))]
         channel = Channel(
             link,
-            link.connect_settings(version, dialled.credentials, is_kept=self.is_kept),
+            link.connect_settings(
+                version,
+                dialled.credentials,
+                is_kept=self.is_kept,
+                refused=self._will_refused[dialled.position],
+            ),
             subscriptions,
             link.least_late(is_kept=self.is_kept),
             is_kept=self.is_kept,
@@ -334,6 +350,11 @@ class Line:
         server = self._backoff.server
         if ending.refuses_version and channel.version == V5:
             return self._fall_back(server)
+        refused = self._will_refused[server]
+        if ending.refused and ending.code in OF_WILL and ending.code not in refused:
+            refused.add(ending.code)
+            log.info("%s: %s: %s; trying another will", self, self.server, ending.text)
+            return 0.0
         if ending.is_new and self._tries_old_version(channel, ending):
             log.info("%s: %s: %s; trying MQTT 3.1.1", self, self.server, ending.text)
             return 0.0

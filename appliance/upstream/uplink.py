@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -23,6 +23,7 @@ from appliance.broker.meter import Meter
 from appliance.broker.ports import Backlogs
 from appliance.mqtt.codec import V5, Properties, Property, quote
 from appliance.mqtt.packets import Subscription, Will
+from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.net.layers import LayerScheduler
 from appliance.upstream.agreement import ConnectSettings, Ending
@@ -349,15 +350,22 @@ class Uplink:
         return self.settings.client_id + ("-keep" if is_kept else "")
 
     def connect_settings(
-        self, version: int, credentials: Credentials, *, is_kept: bool
+        self,
+        version: int,
+        credentials: Credentials,
+        *,
+        is_kept: bool,
+        refused: Collection[ReasonCode],
     ) -> ConnectSettings:
-        """What CONNECT asks for."""
+        """What CONNECT asks for; the broker has `refused` the will because of these."""
         settings = self.settings
         limits = KINDS[settings.kind]
         will = None
         if not is_kept:
             state = self._presence.payload(Presence.BROKEN)
-            will = Will(settings.state_there, state, min(1, limits.qos), limits.retain)
+            qos = 0 if ReasonCode.QOS_NOT_SUPPORTED in refused else min(1, limits.qos)
+            retain = limits.retain and ReasonCode.RETAIN_NOT_SUPPORTED not in refused
+            will = Will(settings.state_there, state, qos, retain)
         return ConnectSettings(
             client_id=self.client_id(is_kept=is_kept),
             version=version,

@@ -293,3 +293,20 @@ async def test_between_two_connects_is_the_time_that_the_broker_asks_for(
                 rig.uplink.clock_was_set()
         times = [visit.began for visit in fleet.visits]
         assert all(later - before > 0.29 for before, later in pairwise(times)), times
+
+
+async def test_a_will_that_the_broker_does_not_take_is_replaced(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet:
+
+        def greet(visit: Visit) -> None:
+            assert visit.connect is not None and visit.connect.will is not None
+            fleet.reason_code = 0x9B if visit.connect.will.qos else 0
+            if visit.connect.will.retain:
+                fleet.reason_code = 0x9A
+            fleet.good_greeting(visit)
+
+        fleet.greet = greet
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await fleet.visited()
+            await until(lambda: rig.status().connected)
+            assert len(fleet.connects) == 3 and {each.version for each in fleet.connects} == {V5}
