@@ -27,7 +27,8 @@ class Readiness:
     """Judges the messages of a link one after the other; times are in seconds of one clock.
 
     It outlives connections, and the time of a wait is that of all topics: what waits behind the
-    first message has waited as well. After a wait in vain no other one begins for as long.
+    first message has waited as well. After a wait in vain no other one begins for as long, unless a
+    node has come after all.
     """
 
     def __init__(self) -> None:
@@ -45,7 +46,9 @@ class Readiness:
         waited, before = now < self._waited_at + FORGOTTEN, self._topic
         self._topic, self._waited_at = topic, -math.inf
         if not obstacle:
-            self._given_up.discard(topic)
+            if topic in self._given_up:  # its node is there after all, and may come back
+                self._given_up.remove(topic)
+                self._again_at = -math.inf
             return False, ""
         if topic in self._given_up or len(self._given_up) >= MOST_TOPICS:
             return False, ""
