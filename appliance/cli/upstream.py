@@ -19,7 +19,10 @@ def upstream(
     config: ConfigOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show the links to fleets' brokers: whether they are connected, and what waits for them."""
+    """Show the links to fleets' brokers: whether they are connected, and what waits for them.
+
+    The exit code is 1 when one is not connected, or no appliance is running.
+    """
     settings = load(config)
     from appliance.ops.control import ControlError, ask
     from appliance.ops.logs import VISIBLE, json_text
@@ -28,9 +31,10 @@ def upstream(
         links: list[dict[str, Any]] = ask(settings.control, "upstream")
     except ControlError as error:
         raise CommandError(str(error)) from None
+    code = 0 if all(link["connected"] for link in links) else 1
     if as_json:
         typer.echo(json_text(links, indent=2))
-        return
+        raise typer.Exit(code)
     if not links:
         typer.echo("there is no link to a fleet's broker (upstreams in appliance.yaml)")
         return
@@ -40,6 +44,7 @@ def upstream(
             typer.echo()
         typer.secho(f"{name}: ", fg="yellow" if is_warning else None, nl=False)
         typer.echo(text.translate(VISIBLE))
+    raise typer.Exit(code)
 
 
 def details(links: list[dict[str, Any]]) -> Iterator[tuple[str, bool, str]]:
@@ -47,6 +52,7 @@ def details(links: list[dict[str, Any]]) -> Iterator[tuple[str, bool, str]]:
 
     The fleet's broker says a part of it: the caller makes control characters visible.
     """
+    from appliance.config import format_duration
     from appliance.upstream.status import warnings_of
 
     for link in links:
@@ -54,11 +60,12 @@ def details(links: list[dict[str, Any]]) -> Iterator[tuple[str, bool, str]]:
         for text in warnings_of(link):
             yield name, True, text
         for rule, reasons in link["dropped"].items():
-            counts = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-            lost = any(reason != REPLACED for reason in reasons)
-            yield name, False, f"{'dropped' if lost else 'not sent'} of {rule}: {counts}"
+            lost = [f"{count} {reason}" for reason, count in reasons.items() if reason != REPLACED]
+            if lost:
+                yield name, False, f"dropped of {rule}: {', '.join(lost)}"
         for each in link["aside"]:
-            yield name, False, f"set aside, {each['topic']}: {each['reason']}"
+            ago = format_duration(max(1, round(each["age"])))
+            yield name, False, f"set aside {ago} ago, {each['topic']}: {each['reason']}"
 
 
 def _row(link: dict[str, Any]) -> tuple[str, ...]:

@@ -1423,8 +1423,9 @@ class Backlog:
         if entry.state != IN_FLIGHT:
             return
         self._counts.set_aside += 1
+        is_latest = entry.value is not None
         self._land(entry)
-        self._aside.add(entry.record, reason, now)
+        self._aside.add(entry.record, reason, now, is_latest=is_latest)
         self._end(entry)
 
     def rewind(self) -> None:

@@ -178,6 +178,15 @@ def subscription_advice(code: int, settings: UpstreamSettings, topic_filter: str
     return f"{what}: {_ITS_LOG}"
 
 
+def message_advice(code: int, settings: UpstreamSettings, topic: str) -> str:
+    """What a person can do about a refused message; empty where there is nothing."""
+    if code == ReasonCode.NOT_AUTHORIZED:
+        return f"let {_who(settings)} write {quote(topic)} there"
+    if code == ReasonCode.TOPIC_NAME_INVALID:
+        return "it does not allow this topic; see prefix and remote_prefix"
+    return ""
+
+
 def state_advice(code: int, settings: UpstreamSettings) -> str:
     """What a person can do when the link may not say that the robot is online."""
     what = "the fleet does not see that the robot is online"

@@ -8,14 +8,16 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from appliance.host.clock import RELEASED
-from appliance.mqtt.codec import NO_PROPERTIES, V5, quote, reason_name
+from appliance.mqtt.codec import NO_PROPERTIES, V5, quote
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream.agreement import EndedBy, Ending
 from appliance.upstream.backlog import Backlog
 from appliance.upstream.limits import FleetLimits
 from appliance.upstream.link import FleetConnection
 from appliance.upstream.publish_properties import PublishProperties
+from appliance.upstream.refusals import message_advice, reason_words
 from appliance.upstream.rule_queue import Entry
+from appliance.upstream.rules import UpstreamSettings
 from appliance.upstream.transport import WRITE_PORTION
 
 #: The wall clock below which it was not set.
@@ -70,9 +72,13 @@ class Sender:
     """
 
     def __init__(
-        self, name: str, backlog: Backlog, clock: Callable[[], float], limits: FleetLimits
+        self,
+        settings: UpstreamSettings,
+        backlog: Backlog,
+        clock: Callable[[], float],
+        limits: FleetLimits,
     ) -> None:
-        self._name = name
+        self._settings = settings
         self._backlog = backlog
         self._clock = clock
         #: Of the kind of broker, and of the present connection.
@@ -158,7 +164,7 @@ class Sender:
         retain = record.retain and limits.retain
         code = connection.publish(entry, topic, payload, qos, retain, properties)
         if code:
-            self._set_aside(entry, f"the fleet's broker does not take it: {reason_name(code)}")
+            self._set_aside(entry, f"the fleet's broker does not take it: {reason_words(code)}")
         elif not qos:
             self._backlog.settle(entry)
 
@@ -180,8 +186,10 @@ class Sender:
             return
         for entry in ours:
             if code in POISON:
-                text = f"the fleet's broker refuses it: {reason_name(code)}"
-                self._set_aside(entry, f"{text}, {quote(reason)}" if reason else text)
+                text = f"the fleet's broker refuses it: {reason_words(code)}"
+                text = f"{text}, {quote(reason)}" if reason else text
+                advice = message_advice(code, self._settings, entry.record.topic)
+                self._set_aside(entry, f"{text}: {advice}" if advice else text)
             else:
                 self._backlog.retry_later(entry, self._clock())
 
@@ -227,7 +235,7 @@ class Sender:
     def _set_aside(self, entry: Entry, reason: str) -> None:
         log.warning(
             "upstream '%s': a message for %s is set aside: %s",
-            self._name,
+            self._settings.name,
             quote(entry.record.topic),
             reason,
         )

@@ -42,6 +42,9 @@ class AsideRecords:
         self._records = records
         self._found: dict[int, SetAside] = {}
         self._size = 0
+        #: By rule and topic, those of them that count only as long as they are the latest. After a
+        #: restart it is not known which do.
+        self._latest: dict[tuple[str, str], int] = {}
         for key, row in records.load():
             try:
                 self._note(key, _decode(row))
@@ -52,11 +55,17 @@ class AsideRecords:
     def __len__(self) -> int:
         return len(self._found)
 
-    def add(self, record: Record, reason: str, now: float) -> None:
-        """Keep a message."""
+    def add(self, record: Record, reason: str, now: float, *, is_latest: bool = False) -> None:
+        """Keep a message. One that `is_latest` of its topic replaces the one before it."""
+        name = record.rule, record.topic
+        if is_latest and name in self._latest:
+            self._forget(self._latest[name])
         text = reason[:_LONGEST_REASON].encode(errors="replace")
         row = _HEADER.pack(now, len(text)) + text + record.encode()
-        self._note(self._records.put(None, row, awaited=False), _decode(row))
+        key = self._records.put(None, row, awaited=False)
+        self._note(key, _decode(row))
+        if is_latest:
+            self._latest[name] = key
         self._limit()
 
     def _note(self, key: int, found: SetAside) -> None:
@@ -66,9 +75,15 @@ class AsideRecords:
     def _limit(self) -> None:
         found = self._found
         while len(found) > MOST_ASIDE or (self._size > ASIDE_SIZE and len(found) > 1):
-            oldest = next(iter(found))
-            self._size -= found.pop(oldest).stored
-            self._records.remove(oldest)
+            self._forget(next(iter(found)))
+
+    def _forget(self, key: int) -> None:
+        found = self._found.pop(key)
+        self._size -= found.stored
+        name = found.rule, found.topic
+        if self._latest.get(name) == key:
+            del self._latest[name]
+        self._records.remove(key)
 
     def list(self) -> list[SetAside]:
         """All of them, the oldest first."""

@@ -54,6 +54,9 @@ log = logging.getLogger(__name__)
 TICK: Final = 1.0
 REPORT_INTERVAL: Final = 10.0
 
+#: The resolution of the event loop's clock, in seconds: no round trip is known to be shorter.
+CLOCK_STEP: Final = 0.001
+
 #: Seconds for which the fleet's broker is asked to keep the session of rules with `offline: keep`.
 KEPT_EXPIRY: Final = 7 * 86400
 
@@ -111,7 +114,7 @@ class Uplink:
         if before is not None:
             waiting = before._backlog.counts().waiting - self._backlog.counts().waiting
             self._forgotten = before._forgotten + max(0, waiting)
-        self._sender = Sender(settings.name, self._backlog, self._journal_clock, limits)
+        self._sender = Sender(settings, self._backlog, self._journal_clock, limits)
         self._out = OutSession(
             self.broker,
             settings,
@@ -436,7 +439,8 @@ class Uplink:
             status.connected = True
             status.version = "5" if channel.version == V5 else "3.1.1"
             status.since = round(self._loop.time() - channel.connected_at, 1)
-            status.round_trip = connection.round_trip
+            if connection.round_trip is not None:
+                status.round_trip = max(connection.round_trip, CLOCK_STEP)
             status.window = connection.room + connection.inflight
             status.inflight = connection.inflight
         status.waiting, status.waiting_bytes = counts.waiting, counts.bytes

@@ -23,7 +23,7 @@ LINK = LinkStatus(
         "r2/events/#": {DropReason.REPLACED.value: 50, DropReason.FULL.value: 3},
     },
 )
-ASIDE = {"rule": "r2/events/#", "topic": "t", "size": 1, "reason": "no\nway", "age": 1.0}
+ASIDE = {"rule": "r2/events/#", "topic": "t", "size": 1, "reason": "no\nway", "age": 300.0}
 
 
 def test_each_thing_to_know_is_a_line_of_its_own(
@@ -32,14 +32,14 @@ def test_each_thing_to_know_is_a_line_of_its_own(
     (tmp_path / "appliance.yaml").write_text(yaml.safe_dump({"robot": "r2"}))
     links = [{**asdict(LINK), "aside": [ASIDE]}]
     monkeypatch.setattr(control, "ask", lambda *_: links)
-    with pytest.raises(SystemExit):
+    with pytest.raises(SystemExit) as ended:
         cli.main(["upstream", "-c", str(tmp_path / "appliance.yaml")])
+    assert ended.value.code == 1  # it is not connected
     head, row, *lines = capsys.readouterr().out.splitlines()
     assert row[head.index("DROPPED") :].split()[0] == "3"  # what was replaced is not lost
     assert lines == [
         "",
         r"fleet: it says\x0awhat\x1b[2J",
-        "fleet: not sent of r2/state/#: 900 replaced",
-        "fleet: dropped of r2/events/#: 50 replaced, 3 full",
-        r"fleet: set aside, t: no\x0away",
+        "fleet: dropped of r2/events/#: 3 full",
+        r"fleet: set aside 5 min ago, t: no\x0away",
     ]

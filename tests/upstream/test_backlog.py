@@ -522,6 +522,17 @@ def test_set_aside() -> None:
     assert link.drain() == []
 
 
+def test_of_a_topic_whose_latest_counts_the_latest_is_set_aside() -> None:
+    link = Link(rule(keep="latest"), rule("a", keep="all"))
+    for of in (0, 0, 0, 1, 1):
+        link.offer("x", of=of)
+        (entry,) = link.take()
+        link.backlog.set_aside(entry, "no", link.backlogs.time)
+    link.backlogs.commit()
+    assert link.counts().set_aside == 5 and link.counts().aside == 3
+    assert len(link.backlogs.aside_records.rows) == 3
+
+
 def test_rates() -> None:
     link = Link(rule("slow", rate=10.0), rule("fast"), rate=100.0)
     for number in range(300):

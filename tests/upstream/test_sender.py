@@ -12,6 +12,7 @@ from appliance.upstream.limits import FleetLimits
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import KeepRule, OutRule
 from appliance.upstream.sender import Sender
+from upstream.links import link as settings_of
 from upstream.test_backlog import Link
 
 
@@ -33,7 +34,7 @@ class Connection:
 
 
 def send(link: Link) -> list[tuple[str, int, object]]:
-    sender = Sender("f", link.backlog, lambda: link.backlogs.time, FleetLimits())
+    sender = Sender(settings_of(), link.backlog, lambda: link.backlogs.time, FleetLimits())
     sender.begin(FleetLimits())
     connection = Connection()
     while sender.send(connection) or link.backlogs.rounds:  # type: ignore[arg-type]

@@ -22,6 +22,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream import channel as channel_module
+from appliance.upstream.refusals import reason_words
 from appliance.upstream.sender import WITHOUT_PROGRESS
 from appliance.upstream.status import warnings_of
 from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
@@ -228,8 +229,10 @@ async def test_what_the_fleet_never_takes_is_set_aside_and_blocks_nothing(
         assert rig.status().set_aside == 1
         (aside,) = rig.uplink.aside()
         assert aside["topic"] == "fleet/r2d2/events/bad"
-        why = ReasonCode(code).name.lower() if code != 0x95 else "0x95"  # PUBACK has no such code
-        assert why in str(aside["reason"]).lower()
+        words = reason_words(code) if code != 0x95 else "0x95"  # PUBACK has no such code
+        assert words in str(aside["reason"])
+        advice = "let this client write 'fleet/r2d2/events/bad' there"
+        assert (advice in str(aside["reason"])) is (code == 0x87)
 
 
 async def test_what_the_fleet_has_no_room_for_is_tried_again(tmp_path: Path) -> None:
