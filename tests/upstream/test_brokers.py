@@ -167,6 +167,12 @@ async def test_rabbitmq(rabbitmq: RabbitMQ, tmp_path: Path, version: str) -> Non
     await carries_both_ways(rig, rabbitmq.plain_port, V311)
 
 
+def is_subscribed(rig: Rig) -> bool:
+    """Whether the fleet's broker has answered the SUBSCRIBE of the present connection."""
+    channel = rig.uplink._lines[0].channel
+    return channel is not None and channel.is_subscribed
+
+
 async def test_what_rabbitmq_does_not_allow(rabbitmq: RabbitMQ, tmp_path: Path) -> None:
     """It closes the connection, and says why nowhere but in its log."""
     kind = {"kind": "rabbitmq", "version": "3.1.1"}
@@ -180,6 +186,7 @@ async def test_what_rabbitmq_does_not_allow(rabbitmq: RabbitMQ, tmp_path: Path) 
         await there.subscribe("fleet/r2d2/events/#")
         await until(lambda: "fleet/r2d2/other/#" in (rig.status().problem or ""))
         await until(lambda: rig.status().missing_filters == ["fleet/r2d2/other/#"])
+        await until(lambda: is_subscribed(rig), "the other filter to be granted")
         here = await local(rig, "r2d2/cmd/#")
         await there.publish("fleet/r2d2/cmd/go", b"in")
         assert (await asyncio.wait_for(next_message(here), 30)).payload == b"in"
