@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -50,6 +50,32 @@ def load(config: Path | None) -> Settings:
         return load_settings(config)
     except ConfigError as error:
         raise CommandError(f"the configuration cannot be used\n{error}") from None
+
+
+def ask_running(config: Path | None, command: str) -> tuple[Any, str]:
+    """What the running appliance answers, and what is wrong with the configuration file: empty when
+    nothing is. It goes on with the configuration that it has.
+
+    Raises:
+        CommandError: it has not answered.
+    """
+    from appliance.config import load_control
+    from appliance.ops.control import ControlError, NotRunningError, ask
+
+    broken: CommandError | None = None
+    try:
+        settings = load(config)
+    except CommandError as error:
+        broken, settings = error, load_control(config)
+    try:
+        answer = ask(settings.control, command)
+    except NotRunningError as error:
+        raise broken or CommandError(str(error)) from None
+    except ControlError as error:
+        raise CommandError(str(error)) from None
+    if broken is None:
+        return answer, ""
+    return answer, f"what is in force is older than the file: {broken}"
 
 
 def new_password(whose: str, file: str | None, generate: bool) -> str:

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.cli.console import CommandError, ConfigOption
-from appliance.cli.console import load as load_settings
+from appliance.cli.console import ConfigOption, ask_running
 
 #: Names of certificates.
 _WHAT = {"server": "the server's certificate", "ca": "the CA", "crl": "the revocation list"}
@@ -21,23 +20,11 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show the state of the running appliance; exit code 1 when none is running."""
-    from appliance.config import load_control
-    from appliance.ops.control import ControlError, NotRunningError, ask
     from appliance.ops.logs import VISIBLE, json_text
 
-    broken: CommandError | None = None
-    try:
-        settings = load_settings(config)
-    except CommandError as error:
-        broken, settings = error, load_control(config)
-    try:
-        report = ask(settings.control, "status")
-    except NotRunningError as error:
-        raise broken or CommandError(str(error)) from None
-    except ControlError as error:
-        raise CommandError(str(error)) from None
-    if broken is not None:
-        report["warnings"].append(str(broken))
+    report, mistake = ask_running(config, "status")
+    if mistake:
+        report["warnings"].append(mistake)
     if as_json:
         typer.echo(json_text(report, indent=2))
         return

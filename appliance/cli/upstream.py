@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from appliance.cli.console import CommandError, ConfigOption, load, print_table
+from appliance.cli.console import ConfigOption, ask_running, print_table
 
 HEAD = ("NAME", "SERVER", "STATE", "WAITING", "BYTES", "OLDEST", "DROPPED", "ASIDE", "MS")
 
@@ -23,14 +23,13 @@ def upstream(
 
     The exit code is 1 when one is not connected, or no appliance is running.
     """
-    settings = load(config)
-    from appliance.ops.control import ControlError, ask
     from appliance.ops.logs import VISIBLE, json_text
 
-    try:
-        links: list[dict[str, Any]] = ask(settings.control, "upstream")
-    except ControlError as error:
-        raise CommandError(str(error)) from None
+    links: list[dict[str, Any]]
+    links, mistake = ask_running(config, "upstream")
+    if mistake:
+        typer.secho("warning: ", fg="yellow", nl=False, err=True)
+        typer.echo(mistake.translate(VISIBLE), err=True)
     code = 0 if all(link["connected"] for link in links) else 1
     if as_json:
         typer.echo(json_text(links, indent=2))

@@ -44,7 +44,8 @@ def read_credentials(login: UpstreamLogin) -> Credentials:
     """Read the files of a login; not in the event loop.
 
     Raises:
-        ValueError: a file cannot be read, or is empty or too long; the text says which.
+        ValueError: a file cannot be read, or its first line is empty or too long; the text says
+            which.
     """
     token = None if login.token_file is None else _read("token_file", login.token_file)
     password = None if login.password_file is None else _read("password_file", login.password_file)
@@ -56,14 +57,20 @@ def read_credentials(login: UpstreamLogin) -> Credentials:
     return Credentials(token, None, expires_at)
 
 
+def first_line(path: Path) -> bytes:
+    """The first line of a file, where its secret is, without white space around it. One that is
+    too long is cut off, to one that is still too long. Raises OSError."""
+    with path.open("rb") as file:
+        return file.readline(LARGEST + 2).strip()
+
+
 def _read(key: str, path: Path) -> bytes:
     try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST + 2).strip()
+        content = first_line(path)
     except OSError as error:
         raise ValueError(f"{path} (login.{key}) cannot be read: {error.strerror}") from None
     if not content:
-        raise ValueError(f"{path} (login.{key}) is empty")
+        raise ValueError(f"{path} (login.{key}) has nothing in its first line")
     if len(content) > LARGEST:
         raise ValueError(f"{path} (login.{key}) is longer than {LARGEST} bytes")
     return content

@@ -30,8 +30,14 @@ def test_each_thing_to_know_is_a_line_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "appliance.yaml").write_text(yaml.safe_dump({"robot": "r2"}))
+    (tmp_path / "broken.yaml").write_text("robott: r2")
     links = [{**asdict(LINK), "aside": [ASIDE]}]
     monkeypatch.setattr(control, "ask", lambda *_: links)
+    with pytest.raises(SystemExit):  # what is in force is shown, whatever the file says
+        cli.main(["upstream", "-c", str(tmp_path / "broken.yaml")])
+    shown = capsys.readouterr()
+    assert "what is in force is older than the file" in shown.err and "robott" in shown.err
+    assert "not connected" in shown.out
     with pytest.raises(SystemExit) as ended:
         cli.main(["upstream", "-c", str(tmp_path / "appliance.yaml")])
     assert ended.value.code == 1  # it is not connected

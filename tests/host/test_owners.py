@@ -171,3 +171,21 @@ def test_whose_a_path_is(folder: Path, etc: Path) -> None:
         assert os.geteuid() == SERVICE
         assert certs  # loaded while root: nothing is imported as another user
     assert (os.geteuid(), os.getegid()) == (0, 0)
+
+
+def test_check_says_what_only_root_can_read(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    secret = home / "fleet.password"
+    secret.touch(0o600)
+    secret.write_text("hunter2")
+    with (home / "appliance.yaml").open("a") as file:
+        file.write(
+            "\nupstreams: [{name: fleet, servers: [mqtts://a], "
+            "login: {username: a, password_file: fleet.password}}]\n"
+        )
+    capsys.readouterr()
+    assert run("check", "-c", str(home / "appliance.yaml")) == 1
+    said = f"{secret}: it belongs to root; the appliance runs as {SERVICE} and cannot read it"
+    assert said in capsys.readouterr().out
+    give(secret)
+    run("check", "-c", str(home / "appliance.yaml"))
+    assert "cannot read it" not in capsys.readouterr().out

@@ -11,6 +11,8 @@ import yaml
 from appliance import certs, config
 from appliance.ops.check import Finding, check
 from appliance.ops.init import initialise
+from appliance.upstream.credentials import read_credentials
+from appliance.upstream.rules import UpstreamLogin
 
 RULES = """\
 user alice
@@ -155,8 +157,13 @@ def test_files_of_a_link(here: Path) -> None:
     ]
     secret.touch(mode=0o600)
     assert "has nothing in its first line" in troubles(here, **keys)[0]
-    secret.write_text("hunter2\n")
+    secret.write_text("\nhunter2\n")  # `run` reads the first line as well
+    assert "has nothing in its first line" in troubles(here, **keys)[0]
+    with pytest.raises(ValueError, match="nothing in its first line"):
+        read_credentials(UpstreamLogin("a", secret))
+    secret.write_text("hunter2\nand more\n")
     assert troubles(here, **keys) == []
+    assert read_credentials(UpstreamLogin("a", secret)).password == b"hunter2"
     secret.chmod(0o640)
     assert troubles(here, **keys) == [
         f"error login.password_file: {secret} is open to others than its owner; close it with: "

@@ -74,6 +74,7 @@ def test_each_server_is_reached_or_the_step_is_named(
         (7, "the proxy"),
     ):
         assert words in told[place][2]
+    assert f"{tls}: at the step tls: " in told[3][2]
     # Nobody has logged in, and nobody has said anything.
     assert "New client connected" not in fleet.log
 

@@ -17,6 +17,7 @@ from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
 from appliance.ops.check.bridge import bridge
 from appliance.ops.check.plugins import plugin_settings
+from appliance.ops.check.readable import readable
 from appliance.ops.check.rights import rights
 from appliance.ops.check.upstreams import upstreams
 from appliance.ops.finding import Finding
@@ -27,7 +28,7 @@ from appliance.store.inspection import summarise
 def check(settings: Settings) -> Iterator[Finding]:
     """Findings about everything that the settings refer to, including those that are ok."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _store, _audit, _plugins, bridge, upstreams]
+    parts = [_listeners, _access, _store, _audit, _plugins, bridge, upstreams, readable]
     if any(listener.tls for listener in settings.broker.listeners):
         parts.insert(2, _certificates)
     for part in parts:

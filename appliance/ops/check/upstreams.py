@@ -22,6 +22,7 @@ from appliance.ops.check.rights import written
 from appliance.ops.finding import Finding
 from appliance.ops.init import call_topics
 from appliance.upstream.answers import new_token, reply_filter
+from appliance.upstream.credentials import first_line
 from appliance.upstream.limits import KINDS, kind_of_host
 from appliance.upstream.rules import InRule, UpstreamSettings
 from appliance.upstream.sessions import in_client_id, kept_client_id, out_client_id
@@ -148,9 +149,8 @@ def _secret(path: Path) -> str:
     try:
         if path.stat().st_mode & 0o077:
             return f"is open to others than its owner; close it with: chmod go= {path}"
-        with path.open("rb") as file:
-            if not file.readline(1 << 16).strip():
-                return "has nothing in its first line, where the secret is to be"
+        if not first_line(path):
+            return "has nothing in its first line, where the secret is to be"
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
         return f"cannot be read: {reason}"

@@ -56,9 +56,8 @@ def links(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
             if not isinstance(outcome, DialError):
                 yield _reached(subject, server, outcome)
             else:
-                text = f"{server}: {outcome}"
-                advice = f"what failed is this step: {outcome.step}"
-                yield Finding("warning" if is_reached else "error", subject, text, advice)
+                text = f"{server}: at the step {outcome.step}: {outcome}"
+                yield Finding("warning" if is_reached else "error", subject, text)
 
 
 def _token(subject: str, link: UpstreamSettings) -> Iterator[Finding]:
