@@ -59,10 +59,13 @@ def store_show(context: typer.Context, config: ConfigOption = None) -> None:
     if waiting:
         print_table([UPSTREAM_HEAD, *waiting])
         typer.echo()
+    kept = sum(each.messages for each in summary.backlogs)
+    upstream = f", beside {kept} for upstreams" if kept else ""
     typer.echo(
         f"{len(summary.sessions)} sessions, {summary.retained} retained messages of "
         f"{summary.retained_size} bytes; all {summary.messages} messages have "
-        f"{summary.payload_size} bytes, {shown(path)} has {format_size(summary.file_size)}"
+        f"{summary.payload_size} bytes{upstream}, "
+        f"{shown(path)} has {format_size(summary.file_size)}"
     )
 
 

@@ -9,7 +9,19 @@ import typer
 
 from appliance.cli.console import ConfigOption, ask_running, print_table
 
-HEAD = ("NAME", "SERVER", "STATE", "WAITING", "BYTES", "OLDEST", "DROPPED", "ASIDE", "MS")
+HEAD = (
+    "NAME",
+    "SERVER",
+    "STATE",
+    "OUT",
+    "IN",
+    "WAITING",
+    "BYTES",
+    "OLDEST",
+    "DROPPED",
+    "ASIDE",
+    "MS",
+)
 
 #: Of messages of which only the latest of a topic counts: the older ones are not lost.
 REPLACED: Final = "replaced"
@@ -58,6 +70,9 @@ def details(links: list[dict[str, Any]]) -> Iterator[tuple[str, bool, str]]:
         name = link["name"]
         for text in warnings_of(link):
             yield name, True, text
+        if link["came"]:
+            came = ", ".join(f"{count} of {rule}" for rule, count in link["came"].items())
+            yield name, False, f"came from there: {came}"
         for rule, reasons in link["dropped"].items():
             lost = [f"{count} {reason}" for reason, count in reasons.items() if reason != REPLACED]
             if lost:
@@ -81,6 +96,8 @@ def _row(link: dict[str, Any]) -> tuple[str, ...]:
         link["name"],
         link["server"],
         "connected" if link["connected"] else "not connected",
+        str(link["sent"]),
+        str(link["received"]),
         str(link["waiting"]),
         about_size(link["waiting_bytes"]),
         "-" if link["oldest"] is None else f"{link['oldest']:.0f} s",

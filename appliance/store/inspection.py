@@ -18,6 +18,7 @@ from appliance.store import database
 from appliance.store.clock import Clocks, boot_id, stamp_of
 from appliance.store.loader import load
 from appliance.store.rows import (
+    LATEST,
     SINGLE_LANE,
     OwedRow,
     ReceivedRow,
@@ -56,13 +57,14 @@ class SessionSummary:
 
 @dataclass(frozen=True, slots=True)
 class BacklogSummary:
-    """What waits for a link to another broker, in one of its lanes.
+    """What is stored for a link to another broker: in the journal of one of its lanes, as the
+    latest of topics, or set aside.
 
-    The size in bytes is that of whole segments; `oldest` is by the wall clock.
+    The size in bytes is that of whole segments; `oldest` is by the wall clock, of journals only.
     """
 
     link: str
-    lane: int
+    lane: int | str
     messages: int
     size: int
     oldest: float | None
@@ -149,15 +151,23 @@ def summarise(path: Path) -> Summary:
 def _backlogs(rows: Rows) -> list[BacklogSummary]:
     loaded = load(rows, 0.0).backlogs
     to_date = _wall_clock(rows)
-    return [
+    found = [
         BacklogSummary(
             *place,
             sum(segment.count - segment.done for segment in segments),
             sum(segment.size for segment in segments),
             to_date(min(segment.first_at for segment in segments)),
         )
-        for place, segments in sorted(loaded.segments.items())
+        for place, segments in loaded.segments.items()
+        if place[1] != SINGLE_LANE
     ]
+    for (link, kind), records in loaded.records.items():
+        # A large one is a record by itself, and what it is says a row of the table `latest`.
+        single = loaded.segments.get((link, SINGLE_LANE), ()) if kind == LATEST else ()
+        size = sum(map(len, records.values())) + sum(segment.size for segment in single)
+        lane = "latest" if kind == LATEST else "set aside"
+        found.append(BacklogSummary(link, lane, len(records), size, None))
+    return sorted(found, key=lambda each: (each.link, str(each.lane)))
 
 
 def _wall_clock(rows: Rows) -> Callable[[Value], float | None]:
@@ -263,7 +273,7 @@ def prune_retained(path: Path, filters: list[str]) -> int:
 
 
 def prune_upstream(path: Path, link: str) -> int:
-    """Delete all that waits for a link to another broker; returns how many messages.
+    """Delete all that is stored for a link to another broker; returns how many messages.
 
     Raises:
         StoreError: an appliance is running, or there is no database, or nothing of that link.
@@ -280,9 +290,7 @@ def prune_upstream(path: Path, link: str) -> int:
                 batch.remove(Table.LATEST, key)
         if not batch:
             raise StoreError(f"nothing waits for an upstream {link!r}")
-        # What a single record is says a row of the table `latest`.
-        waiting = sum(backlog.messages for backlog in found if backlog.lane != SINGLE_LANE)
-        return waiting + len(batch.deleted[Table.LATEST])
+        return sum(backlog.messages for backlog in found)
 
 
 @contextlib.contextmanager

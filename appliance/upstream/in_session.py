@@ -106,7 +106,8 @@ class InCounters:
     circles: int = 0
     uncarried: int = 0
     unexpected_answers: int = 0
-    #: Dropped messages by the filter of their rule, there, and why.
+    #: By the filter of their rule, there, those that were dealt with; and dropped ones, with why.
+    came: Counter[str] = field(default_factory=Counter)
     dropped: Counter[tuple[str, Verdict]] = field(default_factory=Counter)
 
 
@@ -306,11 +307,14 @@ class InSession:
             self._acknowledge(packet, ReasonCode.SUCCESS)
             return True
         if self._is_dropped(came, rule, topic):
+            self._counters.came[rule.remote_filter] += 1
             return True
         if self._is_kept and self._waits_for_ros(topic):
             return False
         message = self._message(came, topic)
-        return self._deliver(came, message, self._session)
+        is_dealt_with = self._deliver(came, message, self._session)
+        self._counters.came[rule.remote_filter] += is_dealt_with
+        return is_dealt_with
 
     def _is_dropped(self, came: _Came, rule: InRule, topic: str) -> bool:
         packet = came.packet

@@ -167,6 +167,13 @@ class OutSession:
         for number, name in enumerate(self._filters, 1):
             if name in session.subscriptions or self._is_undecided(name):
                 continue
+            if name in self.denied:
+                decision = self._broker.router.decide(self._identity, Action.SUBSCRIBE, name)
+                if (
+                    not decision and not decision.pending
+                ):  # still, which needs no other line in the log
+                    self.denied[name] = decision.reason
+                    continue
             # The identifier tells by which filter a retained message was found.
             wanted = Subscription(name, 0, retain_as_published=True, identifier=number)
             code, reason = self._broker.subscribe(session, wanted)

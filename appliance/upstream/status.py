@@ -13,11 +13,11 @@ class LinkStatus:
 
     `problem` is why it is not connected, or what is wrong although it is. `waiting` messages are
     not acknowledged by the fleet's broker yet; the oldest is `oldest` seconds old. `dropped` is by
-    rule and reason, both ways. Of what came, `held_back` messages wait for their receivers here,
-    and `unacknowledged` ones are not acknowledged to the fleet's broker. `forgotten` ones
-    were lost at reloads. `refused_filters` are of subscriptions that it refuses, `missing_filters`
-    of those upon which it closes the connection.
-    `state_refusal` is why the fleet does not see whether the robot is online.
+    rule and reason, both ways. Of what came, which `came` counts by the filters of rules there,
+    `held_back` messages wait for their receivers here, and `unacknowledged` ones are not
+    acknowledged to the fleet's broker. `forgotten` ones were lost at reloads. `refused_filters` are
+    of subscriptions that it refuses, `missing_filters` of those upon which it closes the
+    connection. `state_refusal` is why the fleet does not see whether the robot is online.
     """
 
     name: str
@@ -42,6 +42,7 @@ class LinkStatus:
     offered_a_second: float = 0.0
     received: int = 0
     delivered: int = 0
+    came: dict[str, int] = field(default_factory=dict)
     refused: int = 0
     unacknowledged: int = 0
     held_back: int = 0

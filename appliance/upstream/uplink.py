@@ -450,6 +450,8 @@ class Uplink:
         status.offered_a_second = round(self._offered.rates[0], 1)
         status.sent_a_second = round(self._sent.rates[0], 1)
         status.received = self._in_counters.received
+        came = self._in_counters.came
+        status.came = {rule.remote_filter: came[rule.remote_filter] for rule in settings.inward}
         status.delivered = self._in_counters.delivered
         status.refused = self._in_counters.refused
         for channel in filter(None, (line.channel for line in self._lines)):

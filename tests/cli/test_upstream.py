@@ -17,6 +17,7 @@ LINK = LinkStatus(
     "fleet",
     "generic",
     server="mqtts://a:8883",
+    came={"fleet/r2/cmd/#": 7, "fleet/r2/stop": 0},
     problem="it says\nwhat\x1b[2J",
     dropped={
         "r2/state/#": {DropReason.REPLACED.value: 900},
@@ -46,6 +47,7 @@ def test_each_thing_to_know_is_a_line_of_its_own(
     assert lines == [
         "",
         r"fleet: it says\x0awhat\x1b[2J",
+        "fleet: came from there: 7 of fleet/r2/cmd/#, 0 of fleet/r2/stop",
         "fleet: dropped of r2/events/#: 3 full",
         r"fleet: set aside 5 min ago, t: no\x0away",
     ]

@@ -411,20 +411,26 @@ async def test_what_waits_is_shown_and_pruned(harness: Harness) -> None:
             segment = opened(harness, lane=lane).append(bytes(number))
     opened(harness, lane=1).settle(segment, 3)
     harness.store.backlogs.latest("fleet").put(None, b"latest")
+    harness.store.backlogs.aside("fleet").put(None, b"poison")
+    harness.store.backlogs.single("fleet").put(b"single")
     opened(harness, "other").append(b"x")
     await harness.written()
     shown = summarise(harness.path)
     waiting = [(each.link, each.lane, each.messages, each.size) for each in shown.backlogs]
-    assert waiting == [("fleet", 0, 10, 45), ("fleet", 1, 7, 45), ("other", 0, 1, 1)]
-    assert all(abs((each.oldest or 0) - time.time()) < 100 for each in shown.backlogs)
+    assert waiting == [
+        *(("fleet", 0, 10, 45), ("fleet", 1, 7, 45), ("fleet", "latest", 1, 12)),
+        *(("fleet", "set aside", 1, 6), ("other", 0, 1, 1)),
+    ]
+    dated = [each.oldest for each in shown.backlogs if isinstance(each.lane, int)]
+    assert all(abs((each or 0) - time.time()) < 100 for each in dated)
     exported = [line for line in export(harness.path) if "upstream" in line]
     assert [(each["upstream"], each["messages"]) for each in exported] == [
-        *(("fleet", 10), ("fleet", 7), ("other", 1))
+        *(("fleet", 10), ("fleet", 7), ("fleet", 1), ("fleet", 1), ("other", 1))
     ]
     with pytest.raises(StoreError, match="stop the appliance"):
         prune_upstream(harness.path, "fleet")
     await harness.stop()
-    assert prune_upstream(harness.path, "fleet") == 18
+    assert prune_upstream(harness.path, "fleet") == 19
     with pytest.raises(StoreError, match="nothing waits for an upstream 'fleet'"):
         prune_upstream(harness.path, "fleet")
     harness.start()

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from broker.conftest import FakeStore, lasting
 
+from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.ports import InsideLink
 from appliance.broker.session import REPLAYED_PER_TURN
@@ -84,7 +85,9 @@ def test_the_access_rules_hold_for_it(rig: Rig) -> None:
     assert rig.backlog.taken() == [("fleet/r2/events/x", b"x")]
 
 
-def test_narrowed_rights_end_what_is_offered_and_wider_ones_begin_it(rig: Rig) -> None:
+def test_narrowed_rights_end_what_is_offered_and_wider_ones_begin_it(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     none = "user upstream\ntopic write {robot}/#\n\nuser user\ntopic readwrite #\n"
     rig.reload(none)
     rig.join("first").publish("r2/map", b"old", 1, retain=True)
@@ -106,6 +109,12 @@ def test_narrowed_rights_end_what_is_offered_and_wider_ones_begin_it(rig: Rig) -
     peer.publish("r2/events/x", b"3", 1)
     assert not rig.backlog.taken() and not rig.turns
     assert rig.broker.subscription_count == 1  # for answers
+    # What is refused as before is in the log already.
+    said: list[object] = []
+    monkeypatch.setattr(Broker, "log_rate_limited", lambda *args: said.append(args))
+    rig.reload(none)
+    rig.turn()
+    assert set(rig.out.denied) == {"r2/events/#", "r2/map"} and not said
 
 
 def test_retained_messages_are_offered_once_in_turns(rig: Rig) -> None:

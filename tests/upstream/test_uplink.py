@@ -192,6 +192,7 @@ async def test_a_message_from_there_is_published_here_and_then_acknowledged(
         assert (got.topic, got.payload, got.qos) == ("r2d2/cmd/go", b"fast", 1)
         await peer.send(Puback(got.packet_id))
         await until(lambda: (packet_id, 0) in visit.acknowledged, "PUBACK to the fleet")
+        assert rig.status().came == {"fleet/r2d2/cmd/#": 1}
         peer.hang_up()
 
 
