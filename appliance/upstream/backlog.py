@@ -10,7 +10,8 @@ of them is next, what is dropped when the backlog is full, and what is in memory
   ends, `LIVE_SIZE`, each for the link as a whole. A latest one that has no room there is only on
   disk, by itself, and its topic is in memory, `TOPICS_SIZE`.
 
-A single message may exceed each of these, as it could not be sent otherwise.
+A single message may exceed each of these, as it could not be sent otherwise. Of the rules whose
+messages are refused for now (0x97), each but the first may have twice `IN_FLIGHT_RESERVE` more.
 
 Of a rule, messages of which all count are in its journal, and nothing else is. What counts as the
 latest one of its topic is in its `LatestValues`, and replaced there. So this holds, over any
@@ -85,7 +86,8 @@ VALUES_SIZE: Final = 256 * KIB
 VALUES_AT_ONCE: Final = 32
 
 #: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
-#: higher lane would wait for all of them.
+#: higher lane would wait for all of them. However many wait to be tried again, each rule of which
+#: none does may have as many.
 IN_FLIGHT_RESERVE: Final = 256 * KIB
 
 #: Bytes of read records that a rule has at least, however many rules there are.
@@ -95,7 +97,8 @@ LOADED_SHARE: Final = 32 * KIB
 #: that each gets one in 16.
 TURN: Final = 14
 
-#: Messages that wait to be tried again (0x97); with more, nothing else is sent until one is due.
+#: Messages of a rule that wait to be tried again (0x97); with more, no other of that rule is sent
+#: until one is due. Other rules go on: the fleet's broker may refuse one user's topics only.
 MOST_LATER: Final = 100
 
 #: Seconds until a message is tried again; doubled each time up to the second value.
@@ -232,6 +235,8 @@ class Backlog:
         #: To be tried again: when, number, entry; and how many of them are not GONE.
         self._later: list[tuple[float, int, Entry]] = []
         self._later_count = 0
+        #: Their bytes of memory, which are a part of `_again_size`.
+        self._later_size = 0
         #: Numbers of messages that were stored by themselves and may be in a journal as well, as
         #: what was settled there out of order was not stored.
         self._repeated: set[int] = set()
@@ -933,6 +938,9 @@ class Backlog:
             if not self._again_size:
                 return None
             only_again = size >= IN_FLIGHT_SIZE + IN_FLIGHT_RESERVE
+        most_later = MOST_LATER
+        if only_again and size - self._later_size < IN_FLIGHT_RESERVE:
+            only_again, most_later = False, 1  # only what was refused fills the memory
         bucket, byte_bucket = self._bucket, self._byte_bucket
         if bucket is not None and bucket.due(now) > now:
             return None
@@ -940,19 +948,19 @@ class Backlog:
             return None
         if self._later_count:
             entry = self._next_later(now)
-            if entry is not None or self._later_count >= MOST_LATER:
+            if entry is not None:
                 return entry
         passed = self._passed
         turn = 2 if passed[2] >= TURN else 1 if passed[1] >= TURN else 0
         entry = None
         if turn:
             passed[turn] = 0
-            entry = self._next_of(turn, now, only_again)
+            entry = self._next_of(turn, now, only_again, most_later)
         if entry is None:
             entry = (
-                self._next_of(0, now, only_again)
-                or self._next_of(1, now, only_again)
-                or self._next_of(2, now, only_again)
+                self._next_of(0, now, only_again, most_later)
+                or self._next_of(1, now, only_again, most_later)
+                or self._next_of(2, now, only_again, most_later)
             )
         if entry is None:
             self._idle = True
@@ -1063,8 +1071,11 @@ class Backlog:
             self._again_size += entry.size + ENTRY_OVERHEAD
             self._put_back(entry)
 
-    def _next_of(self, lane: int, now: float, only_again: bool) -> Entry | None:
-        """The next message of a lane, handed out; it drops those that are too old."""
+    def _next_of(self, lane: int, now: float, only_again: bool, most_later: int) -> Entry | None:
+        """The next message of a lane, handed out; it drops those that are too old.
+
+        Of a rule of which so many wait to be tried again, only those that were in flight before.
+        """
         for _ in range(MOST_DROPPED):
             stored: RuleQueue | None = None
             live: RuleQueue | None = None
@@ -1078,7 +1089,8 @@ class Backlog:
                 again, latest = queue.again, queue.latest
                 if again and again[0].state == GONE:
                     queue.skip_gone()
-                if only_again and not again:
+                is_refused = queue.later >= most_later
+                if (only_again or is_refused) and not again:
                     continue
                 if queue.behind and queue.reading is None and 2 * queue.loaded <= self._share:
                     self._read_on(queue, now)
@@ -1097,8 +1109,11 @@ class Backlog:
                     and (stored is None or queue.first_number() < stored.first_number())
                 ):
                     stored = queue
-                if (latest.ready or queue.live) and (
-                    (number := queue.first_live_number()) is not None and number < live_number
+                if (
+                    not is_refused
+                    and (latest.ready or queue.live)
+                    and (number := queue.first_live_number()) is not None
+                    and number < live_number
                 ):
                     live, live_number = queue, number
             if live is not None and (stored is None or self._live_first[lane]):
@@ -1226,7 +1241,7 @@ class Backlog:
             entry = heapq.heappop(later)[2]
             if entry.state != LATER:
                 continue
-            self._later_count -= 1
+            self._count_later(entry, -1)
             record = entry.record
             reason = self._too_old(record.stored_at, record.expires_at, now)
             if reason is None:
@@ -1384,15 +1399,21 @@ class Backlog:
             entry.state = AGAIN
             self._discard(entry, DropReason.REPLACED)
             return
-        if entry.part is not None and self._later_count < MOST_LATER:
+        if entry.part is not None and queue.later < MOST_LATER:
             entry.key = self._latest.put(None, _LATER + entry.record.encode(), awaited=False)
             queue.settle(entry.part, entry.index)
             entry.part = None
             self._check_emptied(queue)
         entry.state = LATER
-        self._later_count += 1
+        self._count_later(entry, 1)
         delay = min(LONGEST_RETRY, FIRST_RETRY * 2 ** min(entry.attempts - 1, 10))
         heapq.heappush(self._later, (now + delay, entry.record.number, entry))
+
+    def _count_later(self, entry: Entry, count: int) -> None:
+        """One more is to be tried again at a time, or one less."""
+        self._later_count += count
+        self._later_size += count * (entry.size + ENTRY_OVERHEAD)
+        entry.queue.later += count
 
     def hold(self, entry: Entry, packet_size: int) -> bool:
         """The fleet's broker takes only smaller packets now: keep it until one takes more, and send
@@ -1496,7 +1517,7 @@ class Backlog:
     def _discard(self, entry: Entry, reason: DropReason) -> None:
         """Drop an entry that is not in flight."""
         if entry.state == LATER:
-            self._later_count -= 1
+            self._count_later(entry, -1)
         self._again_size -= entry.size + ENTRY_OVERHEAD
         self._drop(entry.queue, reason)
         self._end(entry)

@@ -121,6 +121,8 @@ class RuleQueue:
         #: Messages that wait or are in flight, and their bytes.
         self.messages = 0
         self.bytes = 0
+        #: Of `messages`, those that are to be tried again at a time.
+        self.later = 0
 
         self.journal: Journal | None = None
         #: The number of its journal.

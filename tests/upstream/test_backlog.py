@@ -487,6 +487,27 @@ def test_many_retries_hold_up_the_rest() -> None:
         link.backlogs.time = link.backlog.due(link.backlogs.time) or link.backlogs.time + 1
 
 
+@pytest.mark.parametrize("size", [10, 100_000])
+def test_a_rule_that_is_refused_holds_up_itself_alone(size: int) -> None:
+    """One user's topics are refused: those of others go on, however large what waits is."""
+    link = Link(rule("low", "all", "low"), rule("alarms", "all", "high"), rule("x", priority="low"))
+    for number in range(3 * MOST_LATER):
+        link.offer(f"{number}".ljust(size))
+    for _ in range(4):  # whole windows are refused, and a connection ends in between
+        for _, entry in zip(range(MOST_LATER), iter(link.next, None), strict=False):
+            link.backlog.retry_later(entry, link.backlogs.time)
+        link.backlog.rewind()
+        link.backlog.connected()
+    assert link.next() is None
+    assert link.backlog._again_size < module.IN_FLIGHT_SIZE + module.IN_FLIGHT_RESERVE + 2 * size
+    for number in range(10):
+        assert link.offer(f"alarm {number}", of=1) is None
+        assert link.offer(f"{number}", of=2, qos=number % 2) is None
+        sent = link.drain()
+        assert sent == [f"alarm {number}", f"{number}"]
+    assert link.counts().waiting == 3 * MOST_LATER
+
+
 def test_a_latest_one_is_not_tried_again_after_a_newer_one() -> None:
     link = Link(rule(keep="latest"))
     link.offer("1")

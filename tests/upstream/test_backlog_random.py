@@ -158,7 +158,11 @@ class Twin:
         if entry is None:
             self.take_drops()
             ready = [each for each in self.waiting if each.first()]
-            limited = {"e"} | ({each.topic for each in self.rules} if self.is_held_up() else set())
+            limited = {"e"} | {
+                each.topic
+                for of, each in enumerate(self.rules)
+                if self.flying or self.is_refused(of)
+            }
             assert all(
                 self.rules[self.waiting.index(each)].topic in limited or self.is_outdated(each)
                 for each in ready
@@ -174,6 +178,8 @@ class Twin:
             waiting = self.waiting[of]
             self.take_drops()
             heads = {each.name: each for each in [*waiting.first(), *waiting.latest.values()]}
+            if self.is_refused(of):
+                heads = {each.name: each for each in waiting.again[:1]}
             assert name in heads, (name, heads)
             sent = heads[name]
             for queue in (waiting.again, waiting.all, waiting.live):
@@ -197,8 +203,9 @@ class Twin:
             key = sent.of, sent.topic
             self.newest[key] = max(self.newest.get(key, 0), int(sent.name))
 
-    def is_held_up(self) -> bool:
-        return len(self.later) >= module.MOST_LATER or bool(self.flying)
+    def is_refused(self, of: int) -> bool:
+        """Whether so many of a rule are to be tried again that no new one is sent."""
+        return sum(each.of == of for each in self.later.values()) >= module.MOST_LATER
 
     def is_outdated(self, waiting: Waiting) -> bool:
         return all(each.expires_at is not None for each in waiting.first())
@@ -446,6 +453,14 @@ def test_like_a_full_list(seed: int) -> None:
     _compare(Twin(seed, PLAIN, size=4_000), seed, OPERATIONS + ["offer"] * 10)
 
 
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("seed", range(10))
+def test_like_a_list_of_which_much_is_refused(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rule with many that are to be tried again waits, and no other does."""
+    monkeypatch.setattr(module, "MOST_LATER", 2)
+    _compare(Twin(seed, MIXED), seed, OPERATIONS + ["retry"] * 8)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_what_is_too_large_for_one_server_goes_to_another(seed: int) -> None:
     """On a connection that is not cut short all that is not too large for it is sent."""
@@ -594,6 +609,9 @@ class Pair:
             again += [entry for _, _, entry in each._later if entry.state == LATER]
             waiting = [entry.size + ENTRY_OVERHEAD for entry in again if entry.state != GONE]
             assert each._again_size == sum(waiting)
+            later = [entry for _, _, entry in each._later if entry.state == LATER]
+            assert each._later_size == sum(entry.size + ENTRY_OVERHEAD for entry in later)
+            assert sum(queue.later for queue in each._queues.values()) == len(later)
         sizes = [
             (each._flying_size, each._again_size, each._live_size, each._messages, each._bytes)
             for each in (link.backlog for link in self.links)
