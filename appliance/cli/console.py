@@ -75,7 +75,17 @@ def ask_running(config: Path | None, command: str) -> tuple[Any, str]:
         raise CommandError(str(error)) from None
     if broken is None:
         return answer, ""
-    return answer, f"what is in force is older than the file: {broken}"
+    told = str(broken).replace("\n", ": ", 1).replace("\n", "; ")
+    return answer, f"what is in force is older than the file: {told}"
+
+
+def warn(text: str) -> None:
+    """Print a warning beside what the command prints; an empty one is none."""
+    from appliance.ops.logs import VISIBLE
+
+    if text:
+        typer.secho("warning: ", fg="yellow", nl=False, err=True)
+        typer.echo(text.translate(VISIBLE), err=True)
 
 
 def new_password(whose: str, file: str | None, generate: bool) -> str:

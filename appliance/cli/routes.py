@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.cli.console import CommandError, ConfigOption, load, print_table
+from appliance.cli.console import ConfigOption, ask_running, print_table, warn
 
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")
@@ -43,14 +43,9 @@ def routes(
     ] = False,
 ) -> None:
     """Show what the running appliance bridges between ROS and MQTT, and what it skips and why."""
-    settings = load(config)
-    from appliance.ops.control import ControlError, ask
-
-    try:
-        bridged = ask(settings.control, "routes")
-        skipped = ask(settings.control, "skipped")
-    except ControlError as error:
-        raise CommandError(str(error)) from None
+    bridged, mistake = ask_running(config, "routes")
+    skipped, _ = ask_running(config, "skipped")
+    warn(mistake)
     if as_json:
         entries = bridged + (skipped if show_all else [])
         typer.echo("".join(f"{json.dumps(entry)}\n" for entry in entries), nl=False)

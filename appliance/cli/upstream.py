@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from appliance.cli.console import ConfigOption, ask_running, print_table
+from appliance.cli.console import ConfigOption, ask_running, print_table, warn
 
 HEAD = (
     "NAME",
@@ -39,9 +39,7 @@ def upstream(
 
     links: list[dict[str, Any]]
     links, mistake = ask_running(config, "upstream")
-    if mistake:
-        typer.secho("warning: ", fg="yellow", nl=False, err=True)
-        typer.echo(mistake.translate(VISIBLE), err=True)
+    warn(mistake)
     code = 0 if all(link["connected"] for link in links) else 1
     if as_json:
         typer.echo(json_text(links, indent=2))

@@ -38,6 +38,7 @@ def test_each_thing_to_know_is_a_line_of_its_own(
         cli.main(["upstream", "-c", str(tmp_path / "broken.yaml")])
     shown = capsys.readouterr()
     assert "what is in force is older than the file" in shown.err and "robott" in shown.err
+    assert "\\x0a" not in shown.err
     assert "not connected" in shown.out
     with pytest.raises(SystemExit) as ended:
         cli.main(["upstream", "-c", str(tmp_path / "appliance.yaml")])
