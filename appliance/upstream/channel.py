@@ -235,6 +235,8 @@ class Channel:
     def _subscribe_on(self) -> None:
         """Ask for all subscriptions, or for the next one; tell when all are answered."""
         while self._unasked:
+            if self.connection.ended is not None:
+                return  # DISCONNECT came with the last answer: it was not asked
             count = 1 if self._one_by_one else len(self._unasked)
             some = [self._unasked.popleft() for _ in range(count)]
             refused = self.connection.subscribe(some)

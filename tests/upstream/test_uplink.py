@@ -13,6 +13,7 @@ from waiting import until
 
 from appliance.mqtt.codec import V311, Property
 from appliance.mqtt.packets import (
+    Connack,
     Disconnect,
     Puback,
     Publish,
@@ -25,7 +26,7 @@ from appliance.upstream import channel as channel_module
 from appliance.upstream.refusals import reason_words
 from appliance.upstream.sender import WITHOUT_PROGRESS
 from appliance.upstream.status import warnings_of
-from upstream.fake_fleet import FakeFleet, accept, close_at, never, refuse, refuse_topic
+from upstream.fake_fleet import FakeFleet, Visit, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
 from upstream.uplink_rig import Rig, hurry, running
 from upstream.uplink_rig import event_loop_policy as event_loop_policy
@@ -234,6 +235,24 @@ async def test_what_the_fleet_never_takes_is_set_aside_and_blocks_nothing(
         assert words in str(aside["reason"])
         advice = "let this client write 'fleet/r2d2/events/bad' there"
         assert (advice in str(aside["reason"])) is (code == 0x87)
+
+
+async def test_who_disconnects_with_connack_has_refused_no_subscription(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with FakeFleet() as fleet:
+
+        def greet(visit: Visit) -> None:
+            visit.send(Connack(False, 0), Disconnect(ReasonCode.SERVER_SHUTTING_DOWN))
+            visit.close()
+
+        fleet.greet = greet
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await until(lambda: rig.status().connections > 1 and rig.status().problem)
+            assert rig.status().refused_filters == []
+            assert "Server shutting down" in str(rig.status().problem)
+            assert "refuses the subscription" not in caplog.text
+            assert not any(isinstance(each, Subscribe) for each in fleet.packets)
 
 
 async def test_what_the_fleet_has_no_room_for_is_tried_again(tmp_path: Path) -> None:
