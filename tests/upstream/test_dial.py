@@ -276,6 +276,7 @@ class Server:
     def __exit__(self, *_: object) -> None:
         self._listening.shutdown(socket.SHUT_RDWR)
         self._listening.close()
+        self._threads[0].join(10)  # behind it no connection is added
         for _, descriptor, thread in self._open:
             if thread.is_alive():
                 with (
