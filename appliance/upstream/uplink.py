@@ -326,6 +326,8 @@ class Uplink:
                 was_settled = self._is_settled and is_answered
                 is_stuck = self._sender.end(ending, inflight, was_settled=was_settled)
                 is_causeless = is_causeless and self._is_settled and not is_stuck
+                # mosquitto 2.0 with `max_queued_messages 0` closes behind a refused message.
+                is_causeless = is_causeless and self._state_refusal is None
         finally:
             line.on_ended(ending, is_causeless=is_causeless)
         self._report()

@@ -147,6 +147,20 @@ async def test_a_refused_state_is_told_until_the_fleet_takes_it(tmp_path: Path) 
         await until(lambda: rig.status().state_refusal is None)
 
 
+async def test_a_fleet_that_closes_behind_a_refused_state_has_no_other_client(
+    tmp_path: Path,
+) -> None:
+    def refuse_and_close(visit: Visit, packet: Publish) -> None:
+        assert packet.packet_id is not None
+        visit.acknowledge(packet.packet_id, 0x87)
+        visit.close()
+
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        fleet.acknowledge = refuse_and_close
+        await until(lambda: rig.status().connections > 4)
+        assert "another client" not in str(rig.status().problem)
+
+
 async def test_a_link_by_vda5050_says_so_in_its_messages(tmp_path: Path) -> None:
     profile = {"vda5050": {"manufacturer": "acme", "version": "3.0"}}
     there = "vda5050/v3/acme/r2d2/"
