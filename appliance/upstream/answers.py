@@ -22,6 +22,7 @@ import secrets
 from collections.abc import Callable
 from typing import Final
 
+from appliance.mqtt.codec import text_size
 from appliance.mqtt.topics import MAX_TOPIC, check_topic
 from appliance.upstream.rules import UpstreamSettings
 
@@ -31,7 +32,8 @@ LIFETIME: Final = 300.0
 #: The most tokens in each direction.
 MOST_TOKENS: Final = 10_000
 
-#: The most bytes of the topics that the tokens of a direction stand for; one may have 64 KiB.
+#: The most bytes of memory of the topics that the tokens of a direction stand for; one may have
+#: 256 KiB.
 MOST_BYTES: Final = 8 << 20
 
 #: The last level of a topic of calls, see docs/conventions.md; a token is one more level.
@@ -66,7 +68,7 @@ class _Tokens:
             self._end(token)
         self._topics[token] = topic, now + LIFETIME
         self._tokens[topic] = token
-        self._bytes += _size(topic)
+        self._bytes += text_size(topic)
         while len(self._topics) > MOST_TOKENS or self._bytes > MOST_BYTES:
             self._end(next(iter(self._topics)))
         return token
@@ -87,11 +89,7 @@ class _Tokens:
     def _end(self, token: str) -> None:
         topic, _ = self._topics.pop(token)
         del self._tokens[topic]
-        self._bytes -= _size(topic)
-
-
-def _size(topic: str) -> int:
-    return len(topic.encode())
+        self._bytes -= text_size(topic)
 
 
 class Answers:
@@ -140,7 +138,7 @@ class Answers:
         if not _is_call(topic) or not _may_be_answered(response_topic):
             return None
         called = f"{topic}/{self._going.issue(response_topic, now)}"
-        return called if _size(called) <= MAX_TOPIC else None
+        return called if len(called.encode()) <= MAX_TOPIC else None
 
     def for_answer_in(self, topic: str, now: float) -> str | None:
         """The topic here of an answer that came in on `topic`; None when it is for nobody."""

@@ -61,8 +61,10 @@ PATIENCE: Final = 1000
 CLOSED_ON: Final = 3
 WITHOUT_PROGRESS: Final = 2
 
-#: Topics of which it is known whether they can be sent; with more, all are forgotten.
+#: Topics of which it is known whether they can be sent; with more, all are forgotten. Longer ones,
+#: in bytes of UTF-8, are looked at each time.
 KNOWN_TOPICS: Final = 1024
+LONGEST_KNOWN: Final = 256
 
 
 class Sender:
@@ -170,9 +172,11 @@ class Sender:
 
     def _look_at(self, topic: str) -> tuple[int, str]:
         """The bytes of a topic, and why it cannot be used there."""
-        if len(self._topics) >= KNOWN_TOPICS:
-            self._topics.clear()
-        self._topics[topic] = found = len(topic.encode()), self._limits.unusable(topic)
+        found = len(topic.encode()), self._limits.unusable(topic)
+        if found[0] <= LONGEST_KNOWN:
+            if len(self._topics) >= KNOWN_TOPICS:
+                self._topics.clear()
+            self._topics[topic] = found
         return found
 
     def acknowledged(self, entries: Sequence[Entry | None], code: int, reason: str) -> None:

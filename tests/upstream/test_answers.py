@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from itertools import count
 
 import pytest
@@ -76,11 +77,12 @@ def test_the_oldest_tokens_end_when_there_are_too_many(answers: Answers) -> None
 
 
 def test_long_response_topics_do_not_fill_the_memory(answers: Answers) -> None:
-    size = 60_000
-    for number in range(2 * MOST_BYTES // size):
-        last = answers.for_request_in("x", f"{number:06}" + "x" * (size - 6), 0.0)
-    assert len(answers) == MOST_BYTES // size
-    assert last is not None and answers.for_answer_out(last, 0.0) is not None
+    for end in ("x", "\U0001f916"):  # with a character of four bytes in it, each takes four
+        topics = [f"{number:06}".ljust(60_000, "x") + end for number in range(300)]
+        for topic in topics:
+            last = answers.for_request_in("x", topic, 0.0)
+        assert len(answers) == MOST_BYTES // sys.getsizeof(topics[0])
+        assert last is not None and answers.for_answer_out(last, 0.0) is not None
 
 
 @pytest.mark.parametrize("topic", ["", "a/#", "+", "$SYS/x", "$CONTROL/a", "a\nb", "x" * 65_536])

@@ -33,8 +33,12 @@ class Connection:
         return 0
 
 
-def send(link: Link) -> list[tuple[str, int, object]]:
-    sender = Sender(settings_of(), link.backlog, lambda: link.backlogs.time, FleetLimits())
+def sender_of(link: Link) -> Sender:
+    return Sender(settings_of(), link.backlog, lambda: link.backlogs.time, FleetLimits())
+
+
+def send(link: Link, sender: Sender | None = None) -> list[tuple[str, int, object]]:
+    sender = sender or sender_of(link)
     sender.begin(FleetLimits())
     connection = Connection()
     while sender.send(connection) or link.backlogs.rounds:  # type: ignore[arg-type]
@@ -83,3 +87,14 @@ def test_a_rule_in_memory_with_qos_0_is_sent_with_qos_0() -> None:
     link = Link(OutRule("#", "r/", "fleet/", "none", qos=0))
     link.offer("1")
     assert send(link) == [("t", 0, None)]
+
+
+def test_only_short_topics_are_remembered() -> None:
+    """1,024 of 64 KiB with a character of four bytes in each would take 256 MiB."""
+    link = Link()
+    topics = [end.ljust(size, "x") for size in (9, 200, 60_000) for end in ("", "\U0001f916")]
+    for topic in topics:
+        link.offer("1", topic)
+    sender = sender_of(link)
+    assert [topic for topic, *_ in send(link, sender)] == topics
+    assert list(sender._topics) == topics[:4]
