@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Subscription
@@ -397,6 +397,10 @@ class Journal(Protocol):
 
         It is a hint which keeps the list of segments short, and changes nothing else.
         """
+
+
+#: The first byte of a record of `LatestRecords` that is no message, and not to be counted as one.
+NO_MESSAGE: Final = b"N"
 
 
 class LatestRecords(Protocol):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar, cast
 
+from appliance.broker.ports import NO_MESSAGE
 from appliance.mqtt.topics import check_filter, matches
 from appliance.store import database
 from appliance.store.clock import Clocks, boot_id, stamp_of
@@ -164,9 +165,13 @@ def _backlogs(rows: Rows) -> list[BacklogSummary]:
     for (link, kind), records in loaded.records.items():
         # A large one is a record by itself, and what it is says a row of the table `latest`.
         single = loaded.segments.get((link, SINGLE_LANE), ()) if kind == LATEST else ()
-        size = sum(map(len, records.values())) + sum(segment.size for segment in single)
+        messages = list(records.values())
+        if kind == LATEST:
+            messages = [each for each in messages if each[:1] != NO_MESSAGE]
+        size = sum(map(len, messages)) + sum(segment.size for segment in single)
         lane = "latest" if kind == LATEST else "set aside"
-        found.append(BacklogSummary(link, lane, len(records), size, None))
+        if messages:
+            found.append(BacklogSummary(link, lane, len(messages), size, None))
     return sorted(found, key=lambda each: (each.link, str(each.lane)))
 
 

@@ -46,7 +46,7 @@ from functools import partial
 from struct import Struct
 from typing import Final
 
-from appliance.broker.ports import Backlogs, RecordsLostError, Segment
+from appliance.broker.ports import NO_MESSAGE, Backlogs, RecordsLostError, Segment
 from appliance.upstream.latest_values import LatestValue
 from appliance.upstream.rates import TokenBucket
 from appliance.upstream.records import Record, encode_record, record_head, record_times
@@ -123,7 +123,7 @@ HELD: Final = "\0too large"
 # The first byte of rows in the table of latest records.
 _LATEST: Final = b"L"
 _LATER: Final = b"R"
-_NUMBERS: Final = b"N"
+_NUMBERS: Final = NO_MESSAGE
 #: The key and the size of a record that is stored by itself, and its head.
 _SINGLE: Final = b"S"
 _SINGLE_HEADER: Final = Struct(">QI")

@@ -14,7 +14,7 @@ import pytest
 import pytest_asyncio
 from waiting import until
 
-from appliance.broker.ports import SEGMENT_SIZE, Journal, RecordsLostError, Segment
+from appliance.broker.ports import NO_MESSAGE, SEGMENT_SIZE, Journal, RecordsLostError, Segment
 from appliance.net.callbacks import Entries
 from appliance.store import StoreError, committer
 from appliance.store import journal as journal_module
@@ -411,6 +411,7 @@ async def test_what_waits_is_shown_and_pruned(harness: Harness) -> None:
             segment = opened(harness, lane=lane).append(bytes(number))
     opened(harness, lane=1).settle(segment, 3)
     harness.store.backlogs.latest("fleet").put(None, b"latest")
+    harness.store.backlogs.latest("fleet").put(None, NO_MESSAGE)
     harness.store.backlogs.aside("fleet").put(None, b"poison")
     harness.store.backlogs.single("fleet").put(b"single")
     opened(harness, "other").append(b"x")
