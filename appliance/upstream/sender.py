@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.host.clock import RELEASED
 from appliance.mqtt.codec import NO_PROPERTIES, V5, quote
 from appliance.mqtt.reason import ReasonCode
@@ -22,8 +22,6 @@ from appliance.upstream.transport import WRITE_PORTION
 
 #: The wall clock below which it was not set.
 _RELEASED: Final = RELEASED.timestamp()
-
-log = logging.getLogger(__name__)
 
 #: Messages that are sent in one turn of the event loop: half a millisecond of work. Then others
 #: have theirs.
@@ -99,6 +97,11 @@ class Sender:
         #: By topic: its bytes, and why it cannot be used there. Most messages are for a topic that
         #: was looked at before.
         self._topics: dict[str, tuple[int, str]] = {}
+        self._log = RateLimitedLog()
+
+    def tick(self) -> None:
+        """Log how many messages were set aside and not told; to be called every second or so."""
+        self._log.tick(self._clock())
 
     def begin(self, limits: FleetLimits) -> None:
         """A connection is up, with these limits."""
@@ -237,13 +240,16 @@ class Sender:
             self._patience = len(numbers) + PATIENCE
 
     def _set_aside(self, entry: Entry, reason: str) -> None:
-        log.warning(
+        now = self._clock()
+        self._log.warning(
+            now,
+            entry.record.rule,
             "upstream '%s': a message for %s is set aside: %s",
             self._settings.name,
             quote(entry.record.topic),
             reason,
         )
-        self._backlog.set_aside(entry, reason, self._clock())
+        self._backlog.set_aside(entry, reason, now)
 
 
 def _may_be_poison(ending: Ending) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from struct import Struct, error
 from typing import Final
@@ -9,7 +10,8 @@ from typing import Final
 from appliance.broker.ports import LatestRecords
 from appliance.upstream.records import Record
 
-#: The most that are kept of a link, and their bytes on disk. The oldest make room.
+#: The most that are kept of a link, and their bytes on disk. The oldest of the rule that has most
+#: make room: where the fleet's broker refuses what one rule sends, the others' stay.
 MOST_ASIDE: Final = 1000
 ASIDE_SIZE: Final = 16 << 20
 
@@ -42,6 +44,9 @@ class AsideRecords:
         self._records = records
         self._found: dict[int, SetAside] = {}
         self._size = 0
+        #: By rule: those of it, the oldest first, and their bytes.
+        self._of_rule: dict[str, dict[int, None]] = {}
+        self._size_of: Counter[str] = Counter()
         #: By rule and topic, those of them that count only as long as they are the latest. After a
         #: restart it is not known which do.
         self._latest: dict[tuple[str, str], int] = {}
@@ -71,15 +76,29 @@ class AsideRecords:
     def _note(self, key: int, found: SetAside) -> None:
         self._found[key] = found
         self._size += found.stored
+        self._of_rule.setdefault(found.rule, {})[key] = None
+        self._size_of[found.rule] += found.stored
 
     def _limit(self) -> None:
         found = self._found
-        while len(found) > MOST_ASIDE or (self._size > ASIDE_SIZE and len(found) > 1):
-            self._forget(next(iter(found)))
+        while len(found) > MOST_ASIDE:
+            self._forget_one_of(max(self._of_rule, key=lambda rule: len(self._of_rule[rule])))
+        while self._size > ASIDE_SIZE and len(found) > 1:
+            self._forget_one_of(max(self._of_rule, key=self._size_of.__getitem__))
+
+    def _forget_one_of(self, rule: str) -> None:
+        """The oldest of the rule, or of all where it has only the newest of all."""
+        key = next(iter(self._of_rule[rule]))
+        self._forget(key if key != next(reversed(self._found)) else next(iter(self._found)))
 
     def _forget(self, key: int) -> None:
         found = self._found.pop(key)
         self._size -= found.stored
+        of_rule = self._of_rule[found.rule]
+        del of_rule[key]
+        self._size_of[found.rule] -= found.stored
+        if not of_rule:
+            del self._of_rule[found.rule], self._size_of[found.rule]
         name = found.rule, found.topic
         if self._latest.get(name) == key:
             del self._latest[name]

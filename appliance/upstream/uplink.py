@@ -185,6 +185,7 @@ class Uplink:
 
     def _tick(self) -> None:
         self._backlog.tick(self._journal_clock())
+        self._sender.tick()
         counts = self._backlog.counts()
         for line in self._lines:
             line.tick()

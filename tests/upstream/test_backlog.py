@@ -13,6 +13,7 @@ from appliance.upstream import backlog as module
 from appliance.upstream.backlog import MOST_LATER, Backlog, BacklogCounts, DropReason
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
+from appliance.upstream.set_aside import ASIDE_SIZE
 from upstream.plain_backlogs import PlainBacklogs
 
 
@@ -541,6 +542,29 @@ def test_set_aside() -> None:
     assert (found[0].topic, found[0].reason, found[0].size) == ("t", "Not authorized (0x87)", 1)
     assert (found[0].rule, found[0].at) == ("r/#", 1000.0)
     assert link.drain() == []
+
+
+@pytest.mark.parametrize("size", [1, 100_000])
+def test_a_rule_with_many_set_aside_leaves_those_of_others(size: int) -> None:
+    link = Link(rule("a"), rule("b"))
+    link.offer("b", of=1)
+    link.offer("last", of=1)
+    for number in range(1005 if size == 1 else 200):
+        link.offer("x" * size, topic=f"{number}")
+    for entry in iter(link.next, None):
+        link.backlog.set_aside(entry, "no", link.backlogs.time)
+    link.backlogs.commit()
+    found = link.backlog.aside()
+    assert [each.rule for each in found[:3]] == ["r/b", "r/b", "r/a"]
+    assert found[-1].topic == f"{number}"
+    stored = sum(each.stored for each in found)
+    assert len(found) == 1000 if size == 1 else stored <= ASIDE_SIZE < stored + found[-1].stored
+    link.restart()
+    assert link.backlog.aside() == found
+    link.offer("x" * (ASIDE_SIZE + 1), topic="large", of=1)  # is kept, as the newest
+    (entry,) = link.take()
+    link.backlog.set_aside(entry, "no", link.backlogs.time)
+    assert [each.topic for each in link.backlog.aside()] == ["large"]
 
 
 def test_of_a_topic_whose_latest_counts_the_latest_is_set_aside() -> None:

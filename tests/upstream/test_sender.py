@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from appliance.broker.rate_limited_log import BURST, INTERVAL
 from appliance.mqtt.codec import V5, PacketType, Property, decode_properties
 from appliance.upstream import sender as module
 from appliance.upstream.limits import FleetLimits
@@ -98,3 +99,18 @@ def test_only_short_topics_are_remembered() -> None:
     sender = sender_of(link)
     assert [topic for topic, *_ in send(link, sender)] == topics
     assert list(sender._topics) == topics[:4]
+
+
+def test_a_flood_that_is_refused_is_not_a_flood_of_lines(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link(OutRule("a", "r/", "fleet/"), OutRule("b", "r/", "fleet/"))
+    for number in range(100):
+        link.offer("1", f"a/{number}", of=0)
+    link.offer("1", "b/0", of=1)
+    sender = sender_of(link)
+    sender.acknowledged(link.take(), 0x87, "")
+    assert sum("fleet's broker refuses it" in each for each in caplog.messages) == BURST + 1
+    assert "a message for 'b/0' is set aside" in caplog.text
+    link.backlogs.time += INTERVAL
+    sender.tick()
+    assert f"{100 - BURST} more of this kind, the last: upstream 'fleet'" in caplog.messages[-1]
+    assert link.counts().set_aside == 101
