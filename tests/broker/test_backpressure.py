@@ -398,8 +398,8 @@ def test_who_does_not_read_is_not_excused_by_a_slow_disk(
 
 @pytest.mark.lengthy
 @pytest.mark.parametrize("qos", [1, 2])
-@pytest.mark.parametrize("window", [50, 200, 1000], ids="{} in flight".format)
-@pytest.mark.parametrize("size", [1, 3], ids=["to itself", "a ring of three"])
+@pytest.mark.parametrize("window", [50, 100, 200, 1000], ids="{} in flight".format)
+@pytest.mark.parametrize("size", [1, 2, 3], ids=["to itself", "two", "a ring of three"])
 def test_who_publish_to_each_other_do_not_wait_for_each_other(
     join: Join, broker: Broker, qos: int, size: int, window: int
 ):
@@ -607,8 +607,8 @@ def test_an_absent_reader_is_not_waited_for(join: Join, broker: Broker):
 
 @pytest.mark.lengthy
 def test_only_who_publishes_to_the_slow_one_waits(join: Join, broker: Broker):
-    """Of 15 readers one is slow: the others have everything, and another publisher goes on."""
-    readers = [join(f"reader{number}", version=4) for number in range(15)]
+    """Of 50 readers one is slow: the others have everything, and another publisher goes on."""
+    readers = [join(f"reader{number}", version=4) for number in range(50)]
     for reader in readers:
         reader.subscribe("a", 1)
     readers[0].subscribe("b", 0)

@@ -20,15 +20,15 @@ from durability.ordeal import Ordeal
 
 
 def test_nothing_acknowledged_is_lost_by_kills(tmp_path: Path) -> None:
-    report = Ordeal(tmp_path, seed=1).run(kills=3)
+    report = Ordeal(tmp_path, seed=1).run(kills=5)
     assert not report.problems, f"{report}\n" + "\n".join(report.problems)
     assert report.acknowledged > 100, report
 
 
 def test_it_starts_whatever_was_done_to_its_files(tmp_path: Path) -> None:
-    report = Ordeal(tmp_path, seed=2, harm=HARMS["anything"]).run(kills=4)
+    report = Ordeal(tmp_path, seed=2, harm=HARMS["anything"]).run(kills=5)
     assert not report.problems, f"{report}\n" + "\n".join(report.problems)
-    assert report.starts == 5
+    assert report.starts == 6
 
 
 @contextlib.contextmanager

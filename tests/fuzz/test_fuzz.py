@@ -15,7 +15,7 @@ import states
 import strangers
 from codec import Found
 
-SECONDS = 3.0
+SECONDS = 4.0
 
 
 @pytest.fixture(autouse=True)

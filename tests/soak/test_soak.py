@@ -11,7 +11,7 @@ from soak.run import Report, Soak
 
 @pytest.mark.timeout(180)
 def test_random_clients_get_what_they_are_owed(tmp_path: Path) -> None:
-    report = Soak(tmp_path, seconds=8, clients=40, rate=60, seed=20260101).run()
+    report = Soak(tmp_path, seconds=15, clients=40, rate=60, seed=20260101).run()
     wrong = [str(violation) for violation in report.model.violations[:5]]
     assert report.ok, "\n".join([*wrong, *report.problems, report.table()])
     counts = report.model.counts

@@ -8,7 +8,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.msg")
 import costly_calls
 
-SECONDS = 1.0
+SECONDS = 2.0
 
 
 @pytest.fixture(scope="module")

@@ -2169,7 +2169,9 @@ async def test_a_stop_overtakes_a_retained_command_that_is_awaited(harness, stop
 
 
 @pytest.mark.parametrize("size", [0, 2000])
-@pytest.mark.parametrize("off", ["a minute ahead", "an hour ahead", "milliseconds", "no zone"])
+@pytest.mark.parametrize(
+    "off", ["36 s ahead", "a minute ahead", "an hour ahead", "milliseconds", "no zone"]
+)
 @pytest.mark.parametrize("qos", [0, 1, 2])
 async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(harness, qos, off, size):
     harness.start(CommandRules(expire=60, on_silence=OnSilence(60.0)))
@@ -2177,6 +2179,7 @@ async def test_a_stop_whose_sent_at_is_wrong_is_carried_out(harness, qos, off, s
     other.steer()
     now = time.time()
     text = {
+        "36 s ahead": str(now + 36),  # by less than `expire`
         "a minute ahead": str(now + 60),
         "an hour ahead": str(now + 3600),
         "milliseconds": str(int(now * 1000)),

@@ -7,11 +7,10 @@ import shutil
 import pytest
 
 pytest.importorskip("rclpy")
-import old_commands
 from appliance_process import MOSQUITTO
 from old_commands import HERE, mosquitto_pub, run
 
-pytestmark = pytest.mark.usefixtures("isolated_domain")
+pytestmark = [pytest.mark.timed, pytest.mark.usefixtures("isolated_domain")]
 
 has_mqttjs = shutil.which("node") and (HERE.parent / "interop/mqttjs/node_modules/mqtt").exists()
 KINDS = ["paho", *(["mqttjs"] if has_mqttjs else []), *(["bridge"] if MOSQUITTO else [])]
@@ -19,10 +18,8 @@ KINDS = ["paho", *(["mqttjs"] if has_mqttjs else []), *(["bridge"] if MOSQUITTO 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("scenario", ["never_seen", "restart_by_sigkill", "single"])
-async def test_no_old_command_moves_the_robot(scenario, monkeypatch):
+async def test_no_old_command_moves_the_robot(scenario):
     """Of QoS 1 all libraries have a queue; what is new is carried out."""
-    # Old is what was commanded AWAY seconds before; a busy computer delays what is not by a second.
-    monkeypatch.setattr(old_commands, "TOLERANCE", 1.0)
     outcomes = await run(scenario, KINDS, versions=["3.1.1"], qualities=[1])
     assert [outcome for outcome in outcomes if outcome.problem] == []
 
