@@ -14,9 +14,16 @@ from pathlib import Path
 from setuptools import setup
 
 # Not on the way of a message, and left as they are: mypyc takes the `TYPE` of the packet classes
-# for a field of the dataclass, and the values in ports.py are subclassed where nothing is compiled.
+# for a field of the dataclass; values and the links inside the appliance are subclassed where
+# nothing is compiled; and each use of a compiled Protocol first asks whether the object is
+# compiled, too, which what implements these is not.
 INTERPRETED = {
+    Path("appliance/broker/backlogs.py"),
+    Path("appliance/broker/limits.py"),
+    Path("appliance/broker/link.py"),
     Path("appliance/broker/ports.py"),
+    Path("appliance/broker/store.py"),
+    Path("appliance/broker/values.py"),
     Path("appliance/mqtt/connect.py"),
     Path("appliance/mqtt/packets.py"),
 }

@@ -14,9 +14,11 @@ from waiting import PATIENCE
 
 from appliance import certs
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, Limits, Observer, Refusal
+from appliance.broker.ports import Observer
 from appliance.broker.session import Session
+from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
 from appliance.mqtt.reason import ReasonCode

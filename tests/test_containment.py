@@ -34,7 +34,7 @@ from waiting import PATIENCE, until
 from appliance import config
 from appliance.app import main as app_module
 from appliance.app.main import App
-from appliance.broker.ports import Decision
+from appliance.broker.values import Decision
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,

@@ -8,7 +8,7 @@ from appliance.access.login import LoginPlugins, LoginPolicy, no_user
 from appliance.access.passwords import Passwords, check_password, check_username
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.rules import Permission, Rule
-from appliance.broker.ports import Refusal
+from appliance.broker.values import Refusal
 
 __all__ = [
     "AccessFileError",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from appliance.access.rules import Permission, Rule, read_rules
-from appliance.broker.ports import Action, Decision, Identity
+from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.topics import check_filter, matches, overlaps, parse_shared
 
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"

@@ -18,7 +18,8 @@ from appliance.access.passwords import Passwords
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.scram import METHOD, ScramExchange, Verifier
 from appliance.access.throttle import LoginThrottle, RecentKeys
-from appliance.broker.ports import Action, Decision, Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange
+from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.host.addresses import network_prefix
 from appliance.mqtt.codec import quote
 from appliance.mqtt.reason import ReasonCode

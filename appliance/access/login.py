@@ -22,7 +22,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from appliance.access.files import FileAccess
-from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange
+from appliance.broker.values import Identity, Refusal
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode

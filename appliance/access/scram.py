@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 from unicodedata import ucd_3_2_0
 
-from appliance.broker.ports import Accepted, Refusal
+from appliance.broker.values import Accepted, Refusal
 from appliance.mqtt.reason import ReasonCode
 
 METHOD: Final = "SCRAM-SHA-256"

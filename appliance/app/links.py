@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
+from appliance.broker.backlogs import Backlogs
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Backlogs
 from appliance.config import Settings
 from appliance.net.callbacks import Entries
 from appliance.net.layers import LayerScheduler

@@ -24,8 +24,8 @@ from appliance.app import status, wiring
 from appliance.app.links import Links
 from appliance.app.reload import Reload, ReloadError, ReloadParts
 from appliance.broker.broker import Broker
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink
 from appliance.broker.sys_topics import SysTopics
 from appliance.certs import (
     CertificateError,

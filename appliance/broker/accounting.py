@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from appliance.broker.accounts import Account, Accounts, Quotas
 from appliance.broker.counters import Counters
 from appliance.broker.faults import Faults
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Limits, Store
+from appliance.broker.store import Store
 
-if TYPE_CHECKING:
-    from appliance.broker.session import Session
+
+class CongestedReader(Protocol):
+    """A connected receiver that publishers may wait for, see `backpressure`: its session."""
+
+    @property
+    def inflight(self) -> Sized:
+        """What it was sent and has not acknowledged."""
 
 
 @dataclass(slots=True)
@@ -33,11 +39,7 @@ class Accounting:
     #: The part of these that is unprocessed input: partial packets, and topic aliases.
     input_bytes: int = 0
     #: Connected receivers whose queues are more than half full and that publishers may wait for.
-    congested: dict[Session, None] = field(default_factory=dict)
-    #: Sessions to be disconnected at the next flush because their queues overflowed.
-    overflowed: list[Session] = field(default_factory=list)
-    #: Sessions of absent clients whose queues have become full, to be logged, each with the reason.
-    filled: list[tuple[Session, str]] = field(default_factory=list)
+    congested: dict[CongestedReader, None] = field(default_factory=dict)
     #: The limits that every message is checked against, copied from `limits` for speed.
     queue_bytes: int = field(init=False)
     half_queue: int = field(init=False)
@@ -50,8 +52,6 @@ class Accounting:
     reserve: int = field(init=False)
     #: The store's last commit failed: nothing can be stored.
     failing: bool = False
-    #: Whether the rules in force still let a session receive a queued message of a topic.
-    may_still_receive: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
     #: A clock, in seconds, that stops while the clients could do nothing because the broker was
     #: busy or the computer was loaded.
     client_time: Callable[[], float] = field(init=False)

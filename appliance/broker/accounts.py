@@ -9,16 +9,33 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from heapq import nlargest
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-from appliance.broker.ports import Identity, Limits
+from appliance.broker.limits import Limits
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import quote
-
-if TYPE_CHECKING:
-    from appliance.broker.session import Session
+from appliance.mqtt.reason import ReasonCode
 
 #: Empty accounts are removed when the number of accounts exceeds this.
 ACCOUNTS = 64
+
+
+class AccountedSession(Protocol):
+    """A session, as its account knows it."""
+
+    #: The account of its user.
+    account: Account
+
+    @property
+    def client_id(self) -> str:
+        """Its client id."""
+
+    @property
+    def bytes(self) -> int:
+        """Its share of `Account.bytes`."""
+
+    def close_link(self, reason: ReasonCode, message: str) -> None:
+        """End its connection, if it has one."""
 
 
 class Account:
@@ -40,9 +57,9 @@ class Account:
         self.username = username
         self.is_inside = is_inside
         #: Its sessions whose clients are connected, in the order of connecting.
-        self.present: dict[Session, None] = {}
+        self.present: dict[AccountedSession, None] = {}
         #: Its sessions whose clients are absent, in the order of leaving.
-        self.absent: dict[Session, None] = {}
+        self.absent: dict[AccountedSession, None] = {}
         #: Its share of `Accounting.queued_bytes`, and the part of that in output buffers.
         self.bytes = 0
         self.output = 0
@@ -170,7 +187,7 @@ class Accounts:
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def came(self, session: Session) -> None:
+    def came(self, session: AccountedSession) -> None:
         """A session's client has connected; the session may be new."""
         account = session.account
         is_new = session not in account.absent
@@ -182,7 +199,7 @@ class Accounts:
             self.connections += 1
             self.sessions += is_new
 
-    def left(self, session: Session) -> None:
+    def left(self, session: AccountedSession) -> None:
         """A session's client has disconnected, or was absent since the last run."""
         account = session.account
         is_new = session not in account.present
@@ -193,7 +210,7 @@ class Accounts:
             self.connections -= not is_new
             self.sessions += is_new
 
-    def ended(self, session: Session) -> None:
+    def ended(self, session: AccountedSession) -> None:
         """A session ended."""
         account = session.account
         was_present, was_absent = session in account.present, session in account.absent
@@ -203,7 +220,7 @@ class Accounts:
             self.connections -= was_present
             self.sessions -= was_present or was_absent
 
-    def move(self, session: Session, account: Account) -> None:
+    def move(self, session: AccountedSession, account: Account) -> None:
         """Move a session to the account of its user."""
         was_present = session in session.account.present
         self.ended(session)

@@ -23,13 +23,10 @@ Messages of the appliance itself (the bridge, wills, plugins) never wait.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Sequence
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from appliance.broker.accounting import Accounting
-    from appliance.broker.session import Session
+from appliance.broker.accounting import Accounting, CongestedReader
 
 #: Publishers wait for a reader if its full queue would drain within this time, in seconds.
 PATIENCE = 0.25
@@ -136,16 +133,16 @@ class Congestion:
         "_earned",
         "_has_unacknowledged",
         "_held_back",
+        "_reader",
         "_reader_time",
-        "_session",
         "_unwritten",
         "_updated_at",
         "_waiting",
         "awaited",
     )
 
-    def __init__(self, session: Session, accounting: Accounting) -> None:
-        self._session = session
+    def __init__(self, reader: CongestedReader, accounting: Accounting) -> None:
+        self._reader = reader
         self._accounting = accounting
         self._a_message = PATIENCE / accounting.limits.queue_messages
         self._a_byte = PATIENCE / accounting.limits.queue_bytes
@@ -162,7 +159,7 @@ class Congestion:
         self._waiting: dict[Waiting, None] = {}
         #: Whether publishers wait that were not yet woken.
         self.awaited = False
-        accounting.congested[session] = None
+        accounting.congested[reader] = None
 
     def acknowledged(self, packet_id: int, size: int) -> None:
         """The reader has acknowledged a message of `size` bytes."""
@@ -170,7 +167,7 @@ class Congestion:
         by_size = size * self._a_byte
         self._earned += by_size if by_size > self._a_message else self._a_message
         if self._allowance.used_up and self._earned > PATIENCE / 2 and self.patience():
-            self._accounting.congested[self._session] = None
+            self._accounting.congested[self._reader] = None
 
     @property
     def left(self) -> float:
@@ -201,7 +198,7 @@ class Congestion:
         self._update_unacknowledged()
 
     def _update_unacknowledged(self) -> None:
-        inflight = self._session.inflight
+        inflight = self._reader.inflight
         has_unacknowledged = len(self._held_back) < len(inflight) or not inflight
         if has_unacknowledged is not self._has_unacknowledged:
             self._settle()
@@ -220,7 +217,7 @@ class Congestion:
 
     def reader_time(self) -> float:
         """Seconds in all in which publishers waited for this reader, and not for the computer."""
-        if self._session in self._accounting.congested:
+        if self._reader in self._accounting.congested:
             self._settle()
         return self._reader_time
 
@@ -230,7 +227,7 @@ class Congestion:
         allowance = self._allowance
         if not allowance.used_up:
             return allowance.left
-        self._accounting.congested.pop(self._session, None)
+        self._accounting.congested.pop(self._reader, None)
         return 0.0
 
     def wait(self, publisher: Waiting) -> None:
@@ -259,9 +256,9 @@ class Congestion:
         self._held_back.clear()
         self._has_unacknowledged = True
         if not self._allowance.used_up:
-            self._accounting.congested[self._session] = None
+            self._accounting.congested[self._reader] = None
 
     def end(self) -> None:
         """The queue is empty, or its reader disconnected: publishers no longer wait for it."""
-        self._accounting.congested.pop(self._session, None)
+        self._accounting.congested.pop(self._reader, None)
         self.wake()

@@ -15,36 +15,21 @@ from dataclasses import replace
 from datetime import timedelta
 from typing import Protocol, TypeAlias
 
-from appliance.broker.accounting import Accounting
-from appliance.broker.accounts import Account
+from appliance.broker.accounts import Account, AccountedSession
 from appliance.broker.backpressure import Congestion
+from appliance.broker.delivery import Delivery, PendingWill, UnreleasedPublish
 from appliance.broker.faults import Faults
+from appliance.broker.limits import Features, Limits
+from appliance.broker.link import InsideLink, Link
 from appliance.broker.message import DelayedMessage, HeaderCache, Message
-from appliance.broker.ports import (
-    INSIDE,
-    Access,
-    Action,
-    AuditLog,
-    Features,
-    Identity,
-    InsideLink,
-    Limits,
-    Link,
-    Observer,
-    PublishRejection,
-    Store,
-)
+from appliance.broker.ports import Access, AuditLog, Observer
 from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.broker.retained import RetainedMessages
 from appliance.broker.routing import Fanout, Router
-from appliance.broker.session import (
-    Delivery,
-    PendingWill,
-    Session,
-    UnreleasedPublish,
-    subscription_size,
-)
+from appliance.broker.session import Session, SessionAccounting, subscription_size
 from appliance.broker.shared import Share, Target
+from appliance.broker.store import Store
+from appliance.broker.values import INSIDE, Action, Identity, PublishRejection
 from appliance.mqtt.codec import quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -141,7 +126,7 @@ class Broker:
         self.ticked_at = -math.inf
         #: Internal errors that were caught at an entry point.
         self.faults = Faults(self.rate_limited_log)
-        self.accounting = Accounting(self.limits, store, faults=self.faults)
+        self.accounting = SessionAccounting(self.limits, store, faults=self.faults)
         self.counters = self.accounting.counters
         self.sessions: dict[str, Session] = {}
         self.router = Router(access, self.accounting, self.sessions)
@@ -267,10 +252,11 @@ class Broker:
             ending = ending and self._session_to_end(account)
         if ending is not None:
             self._evict(ending, account, "sessions")
-            if self.sessions.get(ending.client_id) is ending:
-                self._end(ending)
+            found = self.sessions.get(ending.client_id)
+            if found is not None and found is ending:
+                self._end(found)
 
-    def _connection_to_end(self, account: Account) -> Session | None:
+    def _connection_to_end(self, account: Account) -> AccountedSession | None:
         """The session whose connection is evicted for one of the account; None if there is room.
 
         Raises:
@@ -286,7 +272,7 @@ class Broker:
             return next(reversed(holder.present))
         raise _all_taken(account, account.connections, "connections", self.limits.connections)
 
-    def _session_to_end(self, account: Account) -> Session | None:
+    def _session_to_end(self, account: Account) -> AccountedSession | None:
         """The session that is evicted for one of the account; None if there is room.
 
         It is the session whose client has been away for longest, of the user with the most
@@ -315,7 +301,7 @@ class Broker:
             return next(reversed(holder.present))
         raise _all_taken(account, account.sessions, "sessions", self.limits.sessions)
 
-    def _evict(self, session: Session, account: Account, what: str) -> None:
+    def _evict(self, session: AccountedSession, account: Account, what: str) -> None:
         """End the connection of a session, if it has one, to make room for the account."""
         self.counters.evicted += 1
         holder = session.account
@@ -501,7 +487,7 @@ class Broker:
 
         def give(delivery: Delivery) -> bool:
             message, _, _, _, share = delivery
-            assert share is not None
+            assert isinstance(share, Share)
             if self.accounting.has_expired(message):
                 return True
             members = known.get(share)

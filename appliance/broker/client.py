@@ -16,6 +16,7 @@ from typing import Any, Final, TypeAlias
 from appliance.broker.backpressure import Allowance, PublisherAllowance
 from appliance.broker.broker import DELAYED_AFTER, HELD_COST, Broker
 from appliance.broker.counters import COST_PER_TURN
+from appliance.broker.delivery import UnreleasedPublish
 from appliance.broker.handshake import (
     Agreement,
     agree,
@@ -27,10 +28,11 @@ from appliance.broker.handshake import (
 from appliance.broker.inflow import Inflow
 from appliance.broker.message import OVERHEAD, DelayedMessage, Message
 from appliance.broker.output import CANNOT_KEEP, Output, in_words
-from appliance.broker.ports import INSIDE, AccessQuery, Exchange, Identity, Refusal, Transport
+from appliance.broker.ports import Exchange, Transport
 from appliance.broker.routing import Fanout
-from appliance.broker.session import Session, UnreleasedPublish
+from appliance.broker.session import Session
 from appliance.broker.subscribing import AwaitingDecision, Step, answers, subscribe, unsubscribe
+from appliance.broker.values import INSIDE, AccessQuery, Identity, Refusal
 from appliance.mqtt.codec import (
     V5,
     V31,
@@ -288,7 +290,7 @@ class ClientHandler:
         counters.publish_bytes_received += len(payload)
         # A cached route has the topic decoded and checked, which saves this for each message.
         if session.epoch == router.epoch and topic_wire in session.routes:
-            route = session.routes[topic_wire]
+            route: Fanout = session.routes[topic_wire]
         else:
             route = router.route(session, topic_wire)
             if route.undecided and self._hold(route, len(payload), self._on_raw_publish, event):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from appliance.broker.delivery import PendingWill
+from appliance.broker.limits import USUAL_PACKET_SIZE, Features, Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import USUAL_PACKET_SIZE, Features, Identity, Limits
-from appliance.broker.session import PendingWill
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+from appliance.broker.values import PublishRejection
 from appliance.mqtt.codec import (
     NO_PROPERTIES,
     PacketType,
@@ -17,10 +18,6 @@ from appliance.mqtt.codec import (
     encode_varint,
     text_size,
 )
-
-if TYPE_CHECKING:
-    from appliance.broker.ports import PublishRejection
-    from appliance.broker.session import Session
 
 #: The approximate memory of a queued message beside its own bytes: the objects around it.
 OVERHEAD = 512
@@ -37,6 +34,14 @@ def _passed_on(properties: Properties) -> bytes:
     """The properties for the receivers, encoded."""
     expiry = Property.MESSAGE_EXPIRY_INTERVAL  # sent to each receiver with its remaining time
     return encode_properties({name: properties[name] for name in properties if name != expiry})
+
+
+class MessagePublisher(Protocol):
+    """The session that publishes a message, see `session.publisher_of`."""
+
+    @property
+    def client_id(self) -> str:
+        """Its client id."""
 
 
 class Message:
@@ -85,7 +90,7 @@ class Message:
         self.qos = qos
         self.retain = retain
         self.expires_at = expires_at
-        self.publisher: Session | None = None
+        self.publisher: MessagePublisher | None = None
         self.rejection: PublishRejection | None = None
         self.topic_wire = topic_wire or encode_string(topic)
         self.properties_wire = _passed_on(properties) if properties else properties_wire

@@ -6,9 +6,12 @@ from collections import deque
 from typing import Protocol, cast
 
 from appliance.broker.broker import Broker
+from appliance.broker.delivery import Delivery
+from appliance.broker.link import PeerStatus
 from appliance.broker.message import Message
-from appliance.broker.ports import PeerStatus, PublishRejection, Transport
-from appliance.broker.session import LARGE_MESSAGE, Delivery, Session
+from appliance.broker.ports import Transport
+from appliance.broker.session import LARGE_MESSAGE, Session
+from appliance.broker.values import PublishRejection
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connack, Disconnect, Packet, Puback, Pubrec, Suback
 from appliance.mqtt.reason import ProtocolError, ReasonCode

@@ -5,17 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from appliance.broker.accounting import Accounting
-from appliance.broker.ports import (
-    Access,
-    AccessQuery,
-    Action,
-    Decision,
-    Identity,
-    PendingDecisions,
-    PublishGuard,
-)
+from appliance.broker.ports import Access, PendingDecisions, PublishGuard
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target, as_target
+from appliance.broker.values import AccessQuery, Action, Decision, Identity
 from appliance.mqtt.codec import decode_string, text_size
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -139,7 +132,7 @@ class Router:
         if session.epoch != self.epoch or len(session.routes) >= CACHED_ROUTES:
             session.routes.clear()
             session.epoch = self.epoch
-        route = session.routes.get(topic_wire)
+        route: Fanout | None = session.routes.get(topic_wire)
         if route is None:
             route = self._find_route(session, topic_wire)
             if len(topic_wire) <= CACHED_TOPIC and not route.undecided:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
+from appliance.broker.delivery import Delivery, PendingWill, UnreleasedPublish
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity
-from appliance.broker.session import Delivery, PendingWill, Session, UnreleasedPublish
+from appliance.broker.session import Session
+from appliance.broker.values import Identity
 from appliance.mqtt.packets import Subscription
 
 

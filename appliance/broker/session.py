@@ -6,37 +6,18 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from typing import TYPE_CHECKING, NamedTuple, cast
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 from appliance.broker.accounting import Accounting
 from appliance.broker.backpressure import Congestion
+from appliance.broker.delivery import Delivery, Group, PendingWill, UnreleasedPublish, held_size
+from appliance.broker.link import Link
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity, Link
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import text_size
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-
-if TYPE_CHECKING:
-    from appliance.broker.routing import Fanout
-    from appliance.broker.shared import Share
-
-
-class Delivery(NamedTuple):
-    """A message on its way to one session.
-
-    On the data path it is a plain tuple, made with `cast`, which costs a fifth. It still needs a
-    class: mypyc would unpack a tuple that is passed between functions and create another one, but
-    the store distinguishes deliveries by their identity.
-    """
-
-    message: Message
-    qos: int
-    retain: bool
-    #: Of the subscriptions that matched.
-    subscription_ids: list[int] | None
-    #: The shared subscription that chose this session among others.
-    share: Share | None
-
 
 #: Retained messages that are sent or skipped for new subscriptions in one turn of the event loop:
 #: some milliseconds, then it is the turn of other clients.
@@ -51,11 +32,6 @@ SUBSCRIPTION_SIZE = 600
 LEVEL_SIZE = 350
 
 
-#: Bytes counted for a held QoS 2 message beside itself, and for each receiver without room.
-HELD_SIZE = 200
-FULL_SIZE = 64
-
-
 def subscription_size(topic_filter: str) -> int:
     """Bytes counted for a subscription: its filter is in the session, and in the tree."""
     return SUBSCRIPTION_SIZE + 2 * text_size(topic_filter) + LEVEL_SIZE * topic_filter.count("/")
@@ -65,34 +41,21 @@ def subscription_size(topic_filter: str) -> int:
 _NUMBERS = itertools.count()
 
 
-class UnreleasedPublish(NamedTuple):
-    """A QoS 2 message that waits for PUBREL, and the receivers without room at its PUBREC."""
-
-    message: Message
-    full: frozenset[Session | Share]
-    #: When it arrived, in seconds of `Transport.now`; unknown if it was sent on another connection.
-    since: float = -math.inf
-
-
-def held_size(held: UnreleasedPublish) -> int:
-    """Bytes that are counted for a held QoS 2 message."""
-    return held.message.size + HELD_SIZE + FULL_SIZE * len(held.full)
-
-
-class PendingWill(NamedTuple):
-    """A will, its delay after the end of the connection, and its expiry interval once published.
-
-    Both times are in seconds; the expiry is None for a will that does not expire.
-    """
-
-    message: Message
-    delay: int
-    expiry: int | None = None
-
-
 def _wrong(kind: str, packet_id: int) -> ProtocolError:
     problem = f"{kind} for message {packet_id}, which waits for something else"
     return ProtocolError(ReasonCode.PROTOCOL_ERROR, problem)
+
+
+@dataclass(slots=True)
+class SessionAccounting(Accounting):
+    """The accounting of the sessions, and what they leave for the broker to do."""
+
+    #: Sessions to be disconnected at the next flush because their queues overflowed.
+    overflowed: list[Session] = field(default_factory=list)
+    #: Sessions of absent clients whose queues have become full, to be logged, each with the reason.
+    filled: list[tuple[Session, str]] = field(default_factory=list)
+    #: Whether the rules in force still let a session receive a queued message of a topic.
+    may_still_receive: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
 
 
 class Session:
@@ -143,7 +106,7 @@ class Session:
         self,
         client_id: str,
         identity: Identity | None,
-        accounting: Accounting,
+        accounting: SessionAccounting,
         *,
         is_inside: bool = False,
     ) -> None:
@@ -195,8 +158,9 @@ class Session:
         #: Whether the client may receive a topic; valid while the epoch is the access rules'.
         self.readable: dict[str, bool] = {}
         self.readable_epoch = -1
-        #: The routes of what this session publishes, by topic; valid while `epoch` is the router's.
-        self.routes: dict[bytes, Fanout] = {}
+        #: The routes of what this session publishes, by topic: a cache of the router, which alone
+        #: knows what a route is. It is valid while `epoch` is the router's.
+        self.routes: dict[bytes, Any] = {}
         self.epoch = -1
         self._last_packet_id = 0
 
@@ -234,7 +198,7 @@ class Session:
         qos: int,
         retain: bool,
         subscription_ids: list[int] | None,
-        share: Share | None = None,
+        share: Group | None = None,
         refusable: bool = True,
     ) -> bool:
         """Send the message, or queue it; False when it was dropped, and counted.
@@ -833,7 +797,7 @@ class Session:
         self.accounting.queued_bytes += size
 
     def hand_over(
-        self, shares: Collection[Share] | None, give: Callable[[Delivery], bool], *, sent: bool
+        self, shares: Collection[Group] | None, give: Callable[[Delivery], bool], *, sent: bool
     ) -> None:
         """Pass messages of these shared subscriptions (None: of all) on to other members.
 
@@ -898,3 +862,10 @@ class Session:
         """End the session's connection, if it has one."""
         if self.link is not None:
             self.link.close(reason, message)
+
+
+def publisher_of(message: Message) -> Session | None:
+    """The session that publishes the message; None when the message is not being delivered."""
+    publisher = message.publisher
+    assert publisher is None or isinstance(publisher, Session)
+    return publisher

@@ -12,8 +12,8 @@ from typing import Final, TypeAlias
 from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.output import in_words
-from appliance.broker.ports import AccessQuery, Action
 from appliance.broker.session import Session
+from appliance.broker.values import AccessQuery, Action
 from appliance.mqtt.codec import Properties, Property, quote
 from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsuback, Unsubscribe
 from appliance.mqtt.reason import ProtocolError, ReasonCode

@@ -161,7 +161,7 @@ def acl_explain(
     """Show what a user may do with a topic, and which rule of which file decides it."""
     settings = load(config)
     from appliance.access import AccessFileError, Acl, Passwords
-    from appliance.broker.ports import Identity
+    from appliance.broker.values import Identity
 
     try:
         acl = Acl.load(settings.broker.acl, settings.robot)

@@ -20,7 +20,7 @@ from pydantic import (
     model_serializer,
 )
 
-from appliance.broker.ports import Features, Limits, UserLimits
+from appliance.broker.limits import Features, Limits, UserLimits
 from appliance.config.quantities import (
     Address,
     Bind,

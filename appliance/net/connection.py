@@ -20,7 +20,9 @@ from typing import cast
 from appliance.broker.accounts import Account
 from appliance.broker.client import ClientHandler
 from appliance.broker.inflow import PAUSE_BEHIND
-from appliance.broker.ports import LOCAL_PEER, Exchange, Identity, PeerStatus, Refusal, TlsInfo
+from appliance.broker.link import LOCAL_PEER, PeerStatus
+from appliance.broker.ports import Exchange
+from appliance.broker.values import Identity, Refusal, TlsInfo
 from appliance.mqtt.framing import MAXIMUM_CONTROL
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode

@@ -18,7 +18,8 @@ from typing import Protocol, TypeAlias
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Exchange, Identity, Refusal
+from appliance.broker.ports import Exchange
+from appliance.broker.values import Identity, Refusal
 from appliance.host.clock import SpareClock
 from appliance.mqtt.packets import Connect
 from appliance.net.callbacks import Entries

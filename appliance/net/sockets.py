@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from appliance.broker.ports import PeerStatus
+from appliance.broker.link import PeerStatus
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from appliance.broker.ports import Action, Identity, TlsInfo
+from appliance.broker.values import Action, Identity, TlsInfo
 from appliance.mqtt.codec import VERSION_NAMES
 from appliance.mqtt.reason import ReasonCode
 

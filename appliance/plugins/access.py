@@ -16,7 +16,8 @@ from amqtt.plugins.manager import PluginManager
 from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Access, AccessQuery, Action, Decision, Identity
+from appliance.broker.ports import Access
+from appliance.broker.values import AccessQuery, Action, Decision, Identity
 from appliance.config.redaction import redacted
 from appliance.net.callbacks import Entries
 from appliance.plugins.adapters import SessionViews, UnclaimedIdentity

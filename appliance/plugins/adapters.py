@@ -13,8 +13,8 @@ from appliance.broker.broker import Broker
 from appliance.broker.client import ClientHandler
 from appliance.broker.message import Message
 from appliance.broker.output import Output
-from appliance.broker.ports import Identity
 from appliance.broker.session import Session
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import V5, Property
 from appliance.mqtt.packets import Connect
 

@@ -25,8 +25,9 @@ from dacite.exceptions import DaciteFieldError, MissingValueError
 from transitions import MachineError
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import Access, InsideLink
+from appliance.broker.ports import Access
 from appliance.broker.session import Session
 from appliance.config.plugins import PluginSettingsError
 from appliance.config.redaction import redacted

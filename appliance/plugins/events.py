@@ -15,8 +15,8 @@ from amqtt.plugins.manager import PluginManager
 from amqtt.session import IncomingApplicationMessage
 
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity
 from appliance.broker.session import Session
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import V31
 from appliance.mqtt.packets import Connect
 from appliance.plugins.adapters import SessionViews, retained_message

@@ -19,7 +19,7 @@ from amqtt.plugins.manager import PluginManager
 from amqtt.session import Session as AmqttSession
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Identity, Refusal
+from appliance.broker.values import Identity, Refusal
 from appliance.config.redaction import redacted
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode

@@ -22,9 +22,9 @@ from typing import Literal, TypeAlias
 import orjson
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
-from appliance.broker.ports import ReceivingLink
-from appliance.broker.session import Session
+from appliance.broker.session import Session, publisher_of
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
@@ -366,8 +366,9 @@ class Bridge:
     def _receive(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
         size = size_of(message.payload)
         number = self._context.staleness.next_number()
+        origin = publisher_of(message)
         for receiver in self._receivers.get(message.topic, ()):
-            self._dispatch(receiver, message, retain, message.publisher, number, size)
+            self._dispatch(receiver, message, retain, origin, number, size)
 
     def _dispatch(
         self,

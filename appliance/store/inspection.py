@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar, cast
 
-from appliance.broker.ports import NO_MESSAGE
+from appliance.broker.backlogs import NO_MESSAGE
 from appliance.mqtt.topics import check_filter, matches
 from appliance.store import database
 from appliance.store.clock import Clocks, boot_id, stamp_of

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+from appliance.broker.backlogs import Backlogs
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Backlogs, Store
+from appliance.broker.store import Store
 
 
 class SessionStore(Store, Protocol):

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from functools import partial
 from operator import attrgetter
 
-from appliance.broker.ports import SEGMENT_SIZE, RecordsLostError, RecordsRead, Segment
+from appliance.broker.backlogs import SEGMENT_SIZE, RecordsLostError, RecordsRead, Segment
 from appliance.store.clock import StoreClock
 from appliance.store.committer import Committer
 from appliance.store.reader import Reader

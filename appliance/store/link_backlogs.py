@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from appliance.broker.ports import Journal, LatestRecords, SingleRecords
+from appliance.broker.backlogs import Journal, LatestRecords, SingleRecords
 from appliance.store.rows import LATEST, SET_ASIDE
 
 AnyJournal = TypeVar("AnyJournal", bound=Journal)

@@ -12,10 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeVar, cast
 
+from appliance.broker.backlogs import Segment
+from appliance.broker.delivery import PendingWill
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity, Segment
 from appliance.broker.saved_sessions import PendingDelivery, SavedSession
-from appliance.broker.session import PendingWill
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import (
     MAXIMUM_PAIRS,
     NO_PROPERTIES,

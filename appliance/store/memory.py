@@ -8,8 +8,9 @@ from collections.abc import Callable
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
+from appliance.broker.delivery import Delivery, UnreleasedPublish
 from appliance.broker.message import Message
-from appliance.broker.session import Delivery, Session, UnreleasedPublish
+from appliance.broker.store import SessionState
 from appliance.mqtt.packets import Subscription
 from appliance.net.callbacks import Entries
 from appliance.store.clock import StoreClock, boot_id
@@ -49,38 +50,38 @@ class MemoryStore(StoreState):
     def hurry(self) -> None:
         """See `Store`."""
 
-    def session_saved(self, session: Session) -> None:
+    def session_saved(self, session: SessionState) -> None:
         """See `Store`."""
 
-    def session_removed(self, session: Session) -> None:
+    def session_removed(self, session: SessionState) -> None:
         """See `Store`."""
 
-    def subscribed(self, session: Session, subscription: Subscription) -> None:
+    def subscribed(self, session: SessionState, subscription: Subscription) -> None:
         """See `Store`."""
 
-    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+    def unsubscribed(self, session: SessionState, topic_filter: str) -> None:
         """See `Store`."""
 
     def retained(self, message: Message, owner: Account) -> None:
         """See `Store`."""
 
-    def queued(self, session: Session, delivery: Delivery) -> None:
+    def queued(self, session: SessionState, delivery: Delivery) -> None:
         """See `Store`."""
 
-    def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+    def sent(self, session: SessionState, delivery: Delivery, packet_id: int) -> None:
         """See `Store`."""
 
-    def settled(self, session: Session, delivery: Delivery) -> None:
+    def settled(self, session: SessionState, delivery: Delivery) -> None:
         """See `Store`."""
 
-    def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+    def recorded(self, session: SessionState, delivery: Delivery, packet_id: int) -> None:
         """See `Store`."""
 
-    def completed(self, session: Session, packet_id: int) -> None:
+    def completed(self, session: SessionState, packet_id: int) -> None:
         """See `Store`."""
 
-    def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
+    def held(self, session: SessionState, packet_id: int, held: UnreleasedPublish) -> None:
         """See `Store`."""
 
-    def unheld(self, session: Session, packet_id: int) -> None:
+    def unheld(self, session: SessionState, packet_id: int) -> None:
         """See `Store`."""

@@ -10,7 +10,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 
-from appliance.broker.ports import SEGMENT_SIZE, RecordsRead, Segment
+from appliance.broker.backlogs import SEGMENT_SIZE, RecordsRead, Segment
 from appliance.store.link_backlogs import LinkBacklogs
 
 #: Calls the function in a later round of the event loop.

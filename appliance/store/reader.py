@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-from appliance.broker.ports import RecordsLostError
+from appliance.broker.backlogs import RecordsLostError
 from appliance.net.callbacks import Entries
 from appliance.store.records import split
 from appliance.store.schema import BUSY_TIMEOUT, is_damage

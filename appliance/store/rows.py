@@ -16,9 +16,10 @@ from enum import IntEnum
 from typing import NamedTuple, TypeAlias, cast
 
 from appliance.broker.accounts import Account
+from appliance.broker.delivery import Delivery, UnreleasedPublish
 from appliance.broker.message import Message
-from appliance.broker.session import Delivery, Session, UnreleasedPublish
 from appliance.broker.shared import Share
+from appliance.broker.store import SessionState
 from appliance.mqtt.codec import (
     NO_PROPERTIES,
     Property,
@@ -246,7 +247,7 @@ def message_row(
     )
 
 
-def session_row(key: int, session: Session, will: int | None, offset: float) -> Row:
+def session_row(key: int, session: SessionState, will: int | None, offset: float) -> Row:
     """The row of a session; `will` is the key of its message."""
     identity = session.identity
     assert identity is not None

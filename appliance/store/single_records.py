@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterable
 from functools import partial
 
-from appliance.broker.ports import RecordsLostError, RecordsRead, Segment
+from appliance.broker.backlogs import RecordsLostError, RecordsRead, Segment
 from appliance.store.clock import StoreClock
 from appliance.store.committer import Committer
 from appliance.store.reader import Reader

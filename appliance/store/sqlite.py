@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import cast
 
 from appliance.broker.broker import Broker
+from appliance.broker.delivery import Delivery
 from appliance.broker.saved_sessions import restore
-from appliance.broker.session import Delivery
 from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.store.clock import KEY, StoreClock, boot_id, stamp_of
 from appliance.store.committer import CommitMetrics

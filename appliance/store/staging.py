@@ -6,9 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from appliance.broker.accounts import Account
+from appliance.broker.delivery import Delivery, UnreleasedPublish
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity
-from appliance.broker.session import Delivery, Session, UnreleasedPublish
+from appliance.broker.session import Session
+from appliance.broker.store import SessionState
+from appliance.broker.values import Identity
 from appliance.mqtt.packets import Subscription
 from appliance.store.backlogs import StoredBacklogs
 from appliance.store.clock import StoreClock
@@ -57,7 +59,7 @@ class StagingStore(StoreState):
         self._committer = Committer(self, path, durability)
         self._messages = StoredMessages(self, self._committer, clock)
         self.backlogs = StoredBacklogs(self._committer, clock)
-        self._sessions: dict[Session, StoredSession] = {}
+        self._sessions: dict[SessionState, StoredSession] = {}
         #: By topic: the key, the message and its owner.
         self._retained: dict[str, tuple[int, Message, Account]] = {}
 
@@ -71,7 +73,7 @@ class StagingStore(StoreState):
 
     # --- sessions ------------------------------------------------------------------------------
 
-    def session_saved(self, session: Session) -> None:
+    def session_saved(self, session: SessionState) -> None:
         """See `Store`; a session without expiry is stored while it has a will, for the will."""
         if not session.expiry and session.will is None:
             self.session_removed(session)
@@ -100,12 +102,12 @@ class StagingStore(StoreState):
         else:
             self._committer.stage_lazily()
 
-    def _put_session(self, session: Session, stored: StoredSession) -> None:
+    def _put_session(self, session: SessionState, stored: StoredSession) -> None:
         will = self._messages.key(stored.will) if stored.will is not None else None
         row = session_row(stored.key, session, will, self._clock.offset)
         self._committer.open.put(Table.SESSION, stored.key, row)
 
-    def _put_contents(self, session: Session) -> None:
+    def _put_contents(self, session: SessionState) -> None:
         """Store what a session has had before it is stored for the first time."""
         for subscription in session.subscriptions.values():
             self.subscribed(session, subscription)
@@ -133,7 +135,7 @@ class StagingStore(StoreState):
         for rows in (stored.filters, stored.owed, stored.recorded, stored.received):
             rows.clear()
 
-    def session_removed(self, session: Session) -> None:
+    def session_removed(self, session: SessionState) -> None:
         """See `Store`."""
         stored = self._sessions.pop(session, None)
         if stored is None:
@@ -144,7 +146,7 @@ class StagingStore(StoreState):
         self._committer.open.remove(Table.SESSION, stored.key)
         self._committer.stage()
 
-    def subscribed(self, session: Session, subscription: Subscription) -> None:
+    def subscribed(self, session: SessionState, subscription: Subscription) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         if stored is None:
@@ -157,7 +159,7 @@ class StagingStore(StoreState):
         self._committer.open.put(Table.SUBSCRIPTION, key, row)
         self._committer.stage()
 
-    def unsubscribed(self, session: Session, topic_filter: str) -> None:
+    def unsubscribed(self, session: SessionState, topic_filter: str) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         key = stored.filters.pop(topic_filter, None) if stored is not None else None
@@ -190,15 +192,15 @@ class StagingStore(StoreState):
 
     # --- deliveries ----------------------------------------------------------------------------
 
-    def queued(self, session: Session, delivery: Delivery) -> None:
+    def queued(self, session: SessionState, delivery: Delivery) -> None:
         """See `Store`."""
         self._put_owed(session, delivery, None)
 
-    def sent(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+    def sent(self, session: SessionState, delivery: Delivery, packet_id: int) -> None:
         """See `Store`."""
         self._put_owed(session, delivery, packet_id)
 
-    def _put_owed(self, session: Session, delivery: Delivery, packet_id: int | None) -> None:
+    def _put_owed(self, session: SessionState, delivery: Delivery, packet_id: int | None) -> None:
         stored = self._sessions.get(session)
         if stored is None:
             return
@@ -216,7 +218,7 @@ class StagingStore(StoreState):
         committer.open.put(Table.OWED, key, row)
         committer.stage()
 
-    def settled(self, session: Session, delivery: Delivery) -> None:
+    def settled(self, session: SessionState, delivery: Delivery) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         entry = stored.owed.pop(id(delivery), None) if stored is not None else None
@@ -225,7 +227,7 @@ class StagingStore(StoreState):
             self._messages.release(delivery[0], session.account)
             self._committer.stage_lazily()
 
-    def recorded(self, session: Session, delivery: Delivery, packet_id: int) -> None:
+    def recorded(self, session: SessionState, delivery: Delivery, packet_id: int) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         entry = stored.owed.pop(id(delivery), None) if stored is not None else None
@@ -237,7 +239,7 @@ class StagingStore(StoreState):
             self._messages.release(delivery[0], stored.account)
             self._committer.stage()
 
-    def completed(self, session: Session, packet_id: int) -> None:
+    def completed(self, session: SessionState, packet_id: int) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         key = stored.recorded.pop(packet_id, None) if stored is not None else None
@@ -247,7 +249,7 @@ class StagingStore(StoreState):
 
     # --- QoS 2 messages of clients -------------------------------------------------------------
 
-    def held(self, session: Session, packet_id: int, held: UnreleasedPublish) -> None:
+    def held(self, session: SessionState, packet_id: int, held: UnreleasedPublish) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         if stored is None:
@@ -264,7 +266,7 @@ class StagingStore(StoreState):
         self._committer.open.put(Table.RECEIVED, key, row)
         self._committer.stage()
 
-    def unheld(self, session: Session, packet_id: int) -> None:
+    def unheld(self, session: SessionState, packet_id: int) -> None:
         """See `Store`."""
         stored = self._sessions.get(session)
         entry = stored.received.pop(packet_id, None) if stored is not None else None

@@ -1,7 +1,7 @@
 """What waits for one link: it is accepted here, handed out in order, and kept until settled.
 
 Pure: time is an argument, in seconds of the journals' clock (`Journal.now`), and what is stored
-goes through the ports in `broker/ports.py`. Each rule has a `RuleQueue`; this module decides which
+goes through `broker/backlogs.py`. Each rule has a `RuleQueue`; this module decides which
 of them is next, what is dropped when the backlog is full, and what is in memory:
 
 - messages that were handed out, at most `IN_FLIGHT_SIZE` bytes;
@@ -46,7 +46,7 @@ from functools import partial
 from struct import Struct
 from typing import Final
 
-from appliance.broker.ports import NO_MESSAGE, Backlogs, RecordsLostError, Segment
+from appliance.broker.backlogs import NO_MESSAGE, Backlogs, RecordsLostError, Segment
 from appliance.upstream.latest_values import LatestValue
 from appliance.upstream.rates import TokenBucket
 from appliance.upstream.records import Record, encode_record, record_head, record_times

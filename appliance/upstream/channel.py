@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import PeerStatus
+from appliance.broker.link import PeerStatus
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries

@@ -23,11 +23,12 @@ from appliance.broker.broker import Broker
 from appliance.broker.client import PACKET_COST, RECHECK, RIGHTS_PATIENCE
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.handshake import is_text
+from appliance.broker.link import InsideLink, PeerStatus
 from appliance.broker.message import OVERHEAD, DatedMessage, Message
 from appliance.broker.output import CANNOT_KEEP
-from appliance.broker.ports import Identity, InsideLink, PeerStatus
 from appliance.broker.routing import Fanout
 from appliance.broker.session import Session
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import (
     NO_PROPERTIES,
     V5,

@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Identity, PublishRejection, ReceivingLink
-from appliance.broker.session import Session
+from appliance.broker.session import Session, publisher_of
+from appliance.broker.values import Action, Identity, PublishRejection
 from appliance.mqtt.codec import V5, Properties, Property, encode_properties, encode_string
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -265,7 +266,8 @@ class OutSession:
             wanted = properties.get(Property.RESPONSE_TOPIC)
             if isinstance(wanted, str):
                 self._broker.counters.cost += REQUEST_COST
-                topic, properties = self._request(topic, wanted, message.publisher, properties)
+                publisher = publisher_of(message)
+                topic, properties = self._request(topic, wanted, publisher, properties)
                 wire = encode_properties(properties)
         return topic, with_via(wire, self._settings.robot)
 

@@ -13,7 +13,7 @@ from collections import deque
 from operator import attrgetter
 from typing import Final
 
-from appliance.broker.ports import Journal, Segment
+from appliance.broker.backlogs import Journal, Segment
 from appliance.upstream.latest_values import LatestValue, LatestValues
 from appliance.upstream.rates import TokenBucket
 from appliance.upstream.records import Record, record_times, record_topic

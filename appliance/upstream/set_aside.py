@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from struct import Struct, error
 from typing import Final
 
-from appliance.broker.ports import LatestRecords
+from appliance.broker.backlogs import LatestRecords
 from appliance.upstream.records import Record
 
 #: The most that are kept of a link, and their bytes on disk. The oldest of the rule that has most

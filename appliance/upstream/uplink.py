@@ -17,10 +17,10 @@ from typing import Final
 
 import orjson
 
+from appliance.broker.backlogs import Backlogs
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.meter import Meter
-from appliance.broker.ports import Backlogs
 from appliance.mqtt.codec import V5, Properties, Property, quote
 from appliance.mqtt.packets import Subscription, Will
 from appliance.mqtt.reason import ReasonCode

@@ -33,7 +33,7 @@ from appliance.access import (
 )
 from appliance.access import passwords as passwords_module
 from appliance.access import rules as rules_module
-from appliance.broker.ports import Action, Identity
+from appliance.broker.values import Action, Identity
 from appliance.mqtt.reason import ReasonCode
 from appliance.mqtt.topics import matches
 

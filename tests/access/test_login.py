@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.access import FileAccess, LoginPolicy, Passwords
-from appliance.broker.ports import Identity, Refusal
+from appliance.broker.values import Identity, Refusal
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode
 

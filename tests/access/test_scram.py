@@ -22,7 +22,7 @@ from raw_client import RawClient
 from appliance.access import AccessFileError, FileAccess, Passwords
 from appliance.access import scram as scram_module
 from appliance.access.scram import METHOD, ScramExchange, Verifier, saslprep
-from appliance.broker.ports import Accepted, Identity, Refusal
+from appliance.broker.values import Accepted, Identity, Refusal
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Auth,

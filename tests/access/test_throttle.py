@@ -17,7 +17,7 @@ from appliance.access import hashing as hashing_module
 from appliance.access import passwords as passwords_module
 from appliance.access import throttle as throttle_module
 from appliance.access.throttle import LoginThrottle, RecentKeys
-from appliance.broker.ports import Accepted, Identity, Refusal
+from appliance.broker.values import Accepted, Identity, Refusal
 from appliance.mqtt.reason import ReasonCode
 
 from .conftest import count_checks

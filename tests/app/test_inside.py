@@ -9,7 +9,9 @@ from appliance.access import Changes
 from appliance.app.reload import Reload, ReloadParts
 from appliance.app.status import Status, StatusParts
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Access, Decision, Identity, InsideLink
+from appliance.broker.link import InsideLink
+from appliance.broker.ports import Access
+from appliance.broker.values import Decision, Identity
 from appliance.mqtt.reason import ReasonCode
 from appliance.store import MemoryStore
 

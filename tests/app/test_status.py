@@ -16,7 +16,9 @@ from raw_client import RawClient
 from appliance import config
 from appliance.app.status import Status, _shortage, topic_shown
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Identity, InsideLink, Limits
+from appliance.broker.limits import Limits
+from appliance.broker.link import InsideLink
+from appliance.broker.values import Identity
 from appliance.config import reading
 from appliance.mqtt.packets import Publish
 from appliance.store import MemoryStore

@@ -10,26 +10,14 @@ import pytest
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.client import ClientHandler
+from appliance.broker.delivery import Delivery, UnreleasedPublish, held_size
+from appliance.broker.limits import Limits, UserLimits
+from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.broker.message import Message
-from appliance.broker.ports import (
-    LOCAL_PEER,
-    Action,
-    Decision,
-    Exchange,
-    Identity,
-    Limits,
-    PeerStatus,
-    TlsInfo,
-    UserLimits,
-)
+from appliance.broker.ports import Exchange
 from appliance.broker.retained import retained_size
-from appliance.broker.session import (
-    Delivery,
-    Session,
-    UnreleasedPublish,
-    held_size,
-    subscription_size,
-)
+from appliance.broker.session import Session, subscription_size
+from appliance.broker.values import Action, Decision, Identity, TlsInfo
 from appliance.mqtt.codec import Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,

@@ -22,8 +22,9 @@ from appliance.broker.backpressure import (
     Allowance,
 )
 from appliance.broker.broker import CHECKS_PER_COST_UNIT, Broker
+from appliance.broker.limits import Limits
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink, Limits
 from appliance.host.clock import SpareClock
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (

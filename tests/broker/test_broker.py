@@ -8,8 +8,9 @@ from __future__ import annotations
 import pytest
 
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Identity, Limits
+from appliance.broker.values import Action, Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,

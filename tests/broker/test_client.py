@@ -14,9 +14,10 @@ import pytest
 
 from appliance.broker import client
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Limits
 from appliance.broker.subscribing import Step, subscribe
+from appliance.broker.values import Action
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Auth,

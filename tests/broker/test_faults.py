@@ -12,10 +12,12 @@ import pytest
 from appliance.broker.backpressure import PublisherAllowance
 from appliance.broker.broker import Broker
 from appliance.broker.faults import PLACES, Faults
+from appliance.broker.limits import Features, Limits
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.output import LONGEST_REASON
-from appliance.broker.ports import Decision, Features, Identity, InsideLink, Limits
 from appliance.broker.session import Session
+from appliance.broker.values import Decision, Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,

@@ -8,10 +8,12 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Limits, UserLimits
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, InsideLink, Limits, UserLimits
 from appliance.broker.session import Session
 from appliance.broker.sys_topics import SysTopics
+from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 

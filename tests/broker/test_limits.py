@@ -9,10 +9,11 @@ import pytest
 
 from appliance.broker.broker import ENDINGS_PER_TICK, Broker
 from appliance.broker.counters import COST_PER_TURN
+from appliance.broker.limits import Features, Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Features, Limits
 from appliance.broker.rate_limited_log import BURST, INTERVAL
 from appliance.broker.session import REPLAYED_PER_TURN, subscription_size
+from appliance.broker.values import Action
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.framing import UNAUTHENTICATED_PAIRS
 from appliance.mqtt.packets import (

@@ -11,11 +11,12 @@ from examples import examples
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
+from appliance.broker.delivery import UnreleasedPublish
+from appliance.broker.limits import Limits
 from appliance.broker.message import OVERHEAD, CountedMessage, HeaderCache, Message
-from appliance.broker.ports import Identity, Limits
-from appliance.broker.session import Session, UnreleasedPublish
+from appliance.broker.session import Session, SessionAccounting
+from appliance.broker.values import Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Packet, Puback, Pubcomp, Publish, Pubrec, Pubrel, Will
 from appliance.mqtt.topics import matches
@@ -419,7 +420,9 @@ class Recorder:
 @pytest.fixture
 def session() -> Session:
     limits = Limits(inflight=2, queue_messages=3, queue_bytes=100_000)
-    session = Session("client", Identity("user", "client"), Accounting(limits, MemoryStore()))
+    session = Session(
+        "client", Identity("user", "client"), SessionAccounting(limits, MemoryStore())
+    )
     session.link = Recorder()
     return session
 

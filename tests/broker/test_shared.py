@@ -12,9 +12,10 @@ import pytest
 from appliance.access import Acl
 from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
-from appliance.broker.ports import Action, Decision, Identity, Limits
+from appliance.broker.limits import Limits
 from appliance.broker.routing import CACHED_TOPIC
 from appliance.broker.shared import MAXIMUM_CHECKED
+from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish
 

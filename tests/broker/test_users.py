@@ -9,8 +9,9 @@ import pytest
 
 from appliance.broker.accounts import ACCOUNTS, Quota
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Features, Limits, UserLimits
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Features, Identity, Limits, UserLimits
+from appliance.broker.values import Action, Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.connect import Connack
 from appliance.mqtt.packets import (

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from appliance import config
-from appliance.broker.ports import Limits, UserLimits
+from appliance.broker.limits import Limits, UserLimits
 from appliance.config import Bind, ConfigError, Settings, reading
 from appliance.config.settings import LimitsSection, UserLimitsSection
 from appliance.net.listeners import Admission

@@ -13,7 +13,7 @@ from harness import abort
 from waiting import PATIENCE
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Identity
+from appliance.broker.values import Identity
 from appliance.mqtt.packets import Connect, Pingreq, Publish, Subscribe, Subscription
 from appliance.net.listeners import Admission, Listeners, ListenerSettings
 

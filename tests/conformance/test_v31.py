@@ -9,7 +9,7 @@ from broker.conftest import FakeAccess, Peer
 from client_v311 import ACCEPTED, Client, connect, wire
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action
+from appliance.broker.values import Action
 
 CLEAN_SESSION = 0x02
 

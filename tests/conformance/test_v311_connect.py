@@ -24,7 +24,7 @@ from client_v311 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action
+from appliance.broker.values import Action
 from appliance.mqtt.packets import Will
 from appliance.mqtt.reason import ReasonCode
 

@@ -7,7 +7,7 @@ from broker.conftest import FakeAccess
 from client_v311 import SESSION_PRESENT, Client, connect, field, joined, owed, packet, refused, wire
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action
+from appliance.broker.values import Action
 
 statement = pytest.mark.statement
 

@@ -17,7 +17,7 @@ from client_v311 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Limits
+from appliance.broker.limits import Limits
 from appliance.mqtt.packets import Puback, Publish, Will
 
 statement = pytest.mark.statement

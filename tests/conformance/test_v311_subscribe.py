@@ -7,8 +7,9 @@ from broker.conftest import FakeAccess
 from client_v311 import Client, field, joined, packet, refused, wire
 
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Limits
+from appliance.broker.values import Action
 
 statement = pytest.mark.statement
 

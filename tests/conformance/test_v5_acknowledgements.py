@@ -7,7 +7,8 @@ from broker.conftest import FakeAccess, lasting
 from client_v5 import disconnect, joined, properties, publish, wire
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action, Features, Limits
+from appliance.broker.limits import Features, Limits
+from appliance.broker.values import Action
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Puback, Pubcomp, Pubrec, Pubrel
 

@@ -23,7 +23,8 @@ from client_v5 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Accepted, Features, Refusal
+from appliance.broker.limits import Features
+from appliance.broker.values import Accepted, Refusal
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Auth, Connack
 from appliance.mqtt.reason import ReasonCode

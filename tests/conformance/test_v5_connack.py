@@ -21,7 +21,7 @@ from client_v5 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Features, Limits
+from appliance.broker.limits import Features, Limits
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import decode_packet
 from appliance.mqtt.reason import ReasonCode

@@ -28,7 +28,8 @@ from client_v5 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action, Features, Limits
+from appliance.broker.limits import Features, Limits
+from appliance.broker.values import Action
 from appliance.mqtt.codec import Property
 from appliance.mqtt.reason import ReasonCode
 

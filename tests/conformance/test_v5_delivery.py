@@ -18,7 +18,8 @@ from client_v5 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action, Limits
+from appliance.broker.limits import Limits
+from appliance.broker.values import Action
 from appliance.mqtt.codec import Property
 
 P = Property

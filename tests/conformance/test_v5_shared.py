@@ -20,7 +20,7 @@ from client_v5 import (
 )
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Limits
+from appliance.broker.limits import Limits
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish
 

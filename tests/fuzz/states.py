@@ -14,8 +14,9 @@ from codec import Found
 from inputs import CLIENTS_OWN, METHOD, Source, damage
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Accepted, Action, Limits, Refusal
+from appliance.broker.limits import Limits
 from appliance.broker.session import Session
+from appliance.broker.values import Accepted, Action, Refusal
 from appliance.mqtt.codec import PacketType, Property
 from appliance.mqtt.packets import (
     Auth,

@@ -15,7 +15,7 @@ from typing import Any
 from broker.conftest import FakeAccess, Peer, lasting
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Limits, UserLimits
+from appliance.broker.limits import Limits, UserLimits
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Connack, Publish, Will
 from appliance.store import MemoryStore

@@ -26,7 +26,7 @@ from waiting import PATIENCE, until
 from appliance import config
 from appliance.app import wiring
 from appliance.broker.accounts import Accounts
-from appliance.broker.ports import Features, Limits
+from appliance.broker.limits import Features, Limits
 from appliance.certs.settings import tls_contexts
 from appliance.mqtt.packets import (
     Connack,

@@ -13,7 +13,7 @@ from harness import Harness, PublishObserver
 from test_websocket import frame, receive_frame, shake_hands
 from waiting import PATIENCE, until
 
-from appliance.broker.ports import LOCAL_PEER, PeerStatus
+from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
 from appliance.net import connection as wire_module
 from appliance.net.connection import ClientConnection

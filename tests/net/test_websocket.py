@@ -25,8 +25,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Response
 
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Limits
 from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.framing import MAXIMUM_CONTROL
 from appliance.mqtt.packets import (

@@ -24,8 +24,8 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 from waiting import eventually
 
-from appliance.broker.ports import Action, Identity, TlsInfo
 from appliance.broker.session import Session
+from appliance.broker.values import Action, Identity, TlsInfo
 from appliance.cli import main as cli
 from appliance.mqtt.packets import Connack, Disconnect, Publish, Subscribe, Subscription
 from appliance.mqtt.reason import ReasonCode

@@ -12,7 +12,7 @@ import pytest
 
 from appliance import certs, config
 from appliance.access import Acl, Passwords
-from appliance.broker.ports import Action, Identity
+from appliance.broker.values import Action, Identity
 from appliance.ops.check import check
 from appliance.ops.init import Credentials, InitError, InitStep, initialise, robot_name
 

@@ -9,7 +9,7 @@ import pytest
 
 from appliance import config
 from appliance.access import Acl
-from appliance.broker.ports import Action, Identity
+from appliance.broker.values import Action, Identity
 from appliance.config import ServerUrl
 from appliance.ops.check import check
 from appliance.ops.init import InitError, InitStep, NextSteps, initialise

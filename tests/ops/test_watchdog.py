@@ -10,7 +10,7 @@ import pytest
 from harness import Harness, make_contexts
 from waiting import until
 
-from appliance.broker.ports import InsideLink
+from appliance.broker.link import InsideLink
 from appliance.broker.session import Session
 from appliance.mqtt.packets import Publish
 from appliance.ops.watchdog import CLOCK_PATIENCE, Pulse

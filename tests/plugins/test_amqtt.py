@@ -33,8 +33,9 @@ from appliance.access import AccessFileError, FileAccess, LoginPolicy, Passwords
 from appliance.app.main import App
 from appliance.broker import client as network_client
 from appliance.broker.broker import Broker
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, InsideLink, Refusal
+from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.config import Settings, load
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Connect, Subscription, Will

@@ -16,7 +16,7 @@ from aiohttp import web
 from test_amqtt import Login, connect_of, own, running
 from waiting import until
 
-from appliance.broker.ports import Action, Decision, Identity, Refusal
+from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.config import secrets_in
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ReasonCode

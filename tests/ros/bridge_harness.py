@@ -7,8 +7,8 @@ import json
 import struct
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge, TopicSettings
 from appliance.ros.node import Durability, FakeNode, QosProfile, Reliability

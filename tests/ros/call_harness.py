@@ -9,8 +9,9 @@ import time
 from waiting import until
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import Action, Decision, Identity, InsideLink
+from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
 from appliance.ros.bridge import Bridge

@@ -10,7 +10,8 @@ import time
 from bridge_harness import TWIST, Harness
 
 from appliance.broker.client import ClientHandler as NetworkClient
-from appliance.broker.ports import Decision, PeerStatus
+from appliance.broker.link import PeerStatus
+from appliance.broker.values import Decision
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connect,

@@ -12,9 +12,10 @@ from broker.conftest import FakeAccess, Peer
 from waiting import PATIENCE
 
 from appliance.broker.broker import Broker
+from appliance.broker.delivery import FULL_SIZE, Delivery, UnreleasedPublish
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Limits
-from appliance.broker.session import FULL_SIZE, Delivery, Session, UnreleasedPublish
+from appliance.broker.session import Session
 from appliance.broker.shared import Share
 from appliance.store import SqliteStore
 

@@ -16,7 +16,7 @@ import pytest_asyncio
 from broker.conftest import ALONE, check_accounts, lasting
 from durability.harm import HARMS
 
-from appliance.broker.ports import Limits
+from appliance.broker.limits import Limits
 from appliance.mqtt.packets import Publish, Subscribe, Subscription
 from appliance.store import SqliteStore, StoreError, schema
 from appliance.store.database import lock

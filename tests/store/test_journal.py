@@ -14,7 +14,7 @@ import pytest
 import pytest_asyncio
 from waiting import until
 
-from appliance.broker.ports import NO_MESSAGE, SEGMENT_SIZE, Journal, RecordsLostError, Segment
+from appliance.broker.backlogs import NO_MESSAGE, SEGMENT_SIZE, Journal, RecordsLostError, Segment
 from appliance.net.callbacks import Entries
 from appliance.store import StoreError, committer
 from appliance.store import journal as journal_module

@@ -16,7 +16,7 @@ from broker.conftest import lasting
 from durability.harm import HARMS
 from waiting import until
 
-from appliance.broker.ports import RecordsLostError
+from appliance.broker.backlogs import RecordsLostError
 from store.harness import Harness
 from store.test_journal import keys, opened, read, unsettled
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from broker.conftest import FakeAccess
 from waiting import until
 
+from appliance.broker.backlogs import SEGMENT_SIZE, Backlogs, Segment
 from appliance.broker.broker import Broker
-from appliance.broker.ports import SEGMENT_SIZE, Backlogs, Segment
 from appliance.store import MemoryStore
 from appliance.store.memory_backlogs import MemoryBacklogs
 

@@ -16,8 +16,9 @@ from broker.conftest import Peer, check_accounts, lasting
 from broker.test_broker import FakeLink
 
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Limits
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink, Limits
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Disconnect,

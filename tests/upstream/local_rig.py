@@ -9,7 +9,9 @@ from broker.conftest import FakeStore, Peer
 
 from appliance.access import FileAccess, Rules
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Features, Limits, PeerStatus, Store
+from appliance.broker.limits import Features, Limits
+from appliance.broker.link import PeerStatus
+from appliance.broker.store import Store
 from appliance.mqtt.codec import (
     NO_PROPERTIES,
     V5,

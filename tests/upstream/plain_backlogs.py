@@ -6,7 +6,7 @@ import copy
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from appliance.broker.ports import RecordsLostError, RecordsRead, Segment
+from appliance.broker.backlogs import RecordsLostError, RecordsRead, Segment
 
 
 class PlainJournal:

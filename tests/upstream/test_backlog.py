@@ -7,7 +7,7 @@ from collections import Counter
 
 import pytest
 
-from appliance.broker.ports import RecordsLostError
+from appliance.broker.backlogs import RecordsLostError
 from appliance.mqtt.codec import NO_PROPERTIES
 from appliance.upstream import backlog as module
 from appliance.upstream.backlog import MOST_LATER, Backlog, BacklogCounts, DropReason

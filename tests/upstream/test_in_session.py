@@ -8,17 +8,11 @@ import pytest
 from broker.conftest import FakeStore, Peer, lasting
 from waiting import until
 
+from appliance.broker.limits import Features, Limits
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import (
-    Action,
-    Decision,
-    Features,
-    Identity,
-    InsideLink,
-    Limits,
-    PublishRejection,
-)
 from appliance.broker.session import Session
+from appliance.broker.values import Action, Decision, Identity, PublishRejection
 from appliance.mqtt.codec import V5, V311, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode

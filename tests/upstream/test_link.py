@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from waiting import PATIENCE as TEST_PATIENCE
 
 from appliance.broker.broker import Broker
-from appliance.broker.ports import Action, Limits
+from appliance.broker.limits import Limits
+from appliance.broker.values import Action
 from appliance.mqtt.codec import (
     Properties,
     Property,

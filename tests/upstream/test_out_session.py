@@ -8,8 +8,8 @@ import pytest
 from broker.conftest import FakeStore, lasting
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
-from appliance.broker.ports import InsideLink
 from appliance.broker.session import REPLAYED_PER_TURN
 from appliance.mqtt.codec import V311, Property
 from appliance.mqtt.packets import Puback, Publish

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from appliance.access import Acl
 from appliance.access.rules import Permission, Rule
-from appliance.broker.ports import Action, Identity
+from appliance.broker.values import Action, Identity
 from appliance.config import Settings
 from appliance.ops.finding import Finding
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from appliance import certs
 from appliance.access import AccessFileError, Acl
-from appliance.broker.ports import Action, Identity
+from appliance.broker.values import Action, Identity
 from appliance.config import Settings, TopicRoute, format_duration, format_size
 from appliance.mqtt.codec import V5, V311
 from appliance.mqtt.topics import overlaps

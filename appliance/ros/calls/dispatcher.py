@@ -33,9 +33,9 @@ from functools import partial
 from typing import Literal, TypeAlias, TypeVar
 
 from appliance.broker.broker import Broker
+from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
-from appliance.broker.ports import ReceivingLink
-from appliance.broker.session import Session
+from appliance.broker.session import Session, publisher_of
 from appliance.mqtt.codec import Property, encode_string, quote
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -360,12 +360,13 @@ class CallDispatcher:
 
     def _receive(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
         """Pass a message that a client has published to the handler of the subscription."""
-        if message.publisher is None or not subscription_ids:
+        caller = publisher_of(message)
+        if caller is None or not subscription_ids:
             return
         self._broker.counters.cost += len(message.payload) // BYTES_PER_COST_UNIT
         handler = self._handlers.get(subscription_ids[0])
         if handler is not None:
-            handler(message.publisher, message)
+            handler(caller, message)
 
     def publish(self, message: Message) -> ReasonCode:
         """Publish as the appliance; returns 0x10 when there is no matching subscription."""

@@ -15,9 +15,10 @@ from collections import deque
 from dataclasses import dataclass
 from functools import partial
 
+from appliance.broker.link import LOCAL_PEER
 from appliance.broker.message import Message
-from appliance.broker.ports import LOCAL_PEER, PublishRejection
 from appliance.broker.session import Session
+from appliance.broker.values import PublishRejection
 from appliance.mqtt.reason import ReasonCode
 from appliance.ros.node import BusError
 from appliance.ros.payload.converter import ConversionError

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Protocol
 from weakref import WeakValueDictionary
 
-from appliance.broker.ports import Decision
 from appliance.broker.session import Session
+from appliance.broker.values import Decision
 
 #: The client id of the bridge's own session, which has no identity.
 BRIDGE_CLIENT_ID = "_bridge"

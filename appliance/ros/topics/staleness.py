@@ -52,7 +52,7 @@ from datetime import datetime, timezone
 from enum import Enum
 from typing import Protocol
 
-from appliance.broker.ports import LOCAL_PEER, PeerStatus
+from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property, quote
 

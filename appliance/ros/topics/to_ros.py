@@ -9,8 +9,8 @@ from typing import ClassVar
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
-from appliance.broker.ports import Decision, PublishRejection
 from appliance.broker.session import Session
+from appliance.broker.values import Decision, PublishRejection
 from appliance.mqtt.codec import Property, quote
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries

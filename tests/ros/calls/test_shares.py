@@ -13,11 +13,12 @@ from call_harness import AllTypes, CallHarness, action, call_routes, parameters,
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.broker.accounting import Accounting
 from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
+from appliance.broker.limits import Limits
 from appliance.broker.message import Message
-from appliance.broker.ports import Identity, Limits
+from appliance.broker.session import SessionAccounting
+from appliance.broker.values import Identity
 from appliance.net.callbacks import Entries
 from appliance.ros.bridge import TopicSettings
 from appliance.ros.calls import actions
@@ -411,7 +412,7 @@ LARGE = turns.LITTLE + 1
 
 def conversion_queue(memory=1 << 20):
     clock = Clock()
-    accounting = Accounting(Limits(memory=memory), MemoryStore())
+    accounting = SessionAccounting(Limits(memory=memory), MemoryStore())
     return clock, turns.ConversionQueue(Entries(clock, Faults()), accounting)
 
 

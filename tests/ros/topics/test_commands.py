@@ -16,8 +16,9 @@ from zstandard import ZstdCompressor
 
 from appliance.broker.accounting import Accounting
 from appliance.broker.broker import Broker
+from appliance.broker.link import PeerStatus
 from appliance.broker.message import DelayedMessage, Message
-from appliance.broker.ports import Action, Decision, PeerStatus
+from appliance.broker.values import Action, Decision
 from appliance.mqtt.codec import Property, decode_varint
 from appliance.mqtt.packets import (
     Disconnect,
