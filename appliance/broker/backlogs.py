@@ -142,6 +142,10 @@ class Backlogs(Protocol):
     def failing(self) -> bool:
         """Whether nothing can be stored now: whatever is appended stays in memory until it can."""
 
+    @property
+    def unwritten(self) -> int:
+        """Bytes of records that are in memory because they are not on disk yet."""
+
     def journal(self, link: str, lane: int) -> Journal:
         """The link's journal of that lane; the same object each time."""
 

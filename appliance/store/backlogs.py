@@ -87,6 +87,11 @@ class StoredBacklogs(LinkBacklogs[StoredJournal, StoredLatestRecords, StoredSing
         """See `Backlogs`."""
         return self._committer.failing
 
+    @property
+    def unwritten(self) -> int:
+        """See `Backlogs`."""
+        return self._committer.unwritten
+
     def _make_journal(self, link: str, lane: int) -> StoredJournal:
         assert self._reader is not None, "not before `restore`"
         segments = self._loaded.segments.get((link, lane), [])

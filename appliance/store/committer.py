@@ -24,6 +24,9 @@ log = logging.getLogger("appliance.store")
 #: of the last second are lost, and what they are about is repeated.
 LINGER = 1.0
 
+#: Bytes of what links keep at which a batch is committed though nothing depends on it.
+LARGE = 1 << 20
+
 #: Seconds until a batch that could not be written is tried again.
 RETRY = 1.0
 
@@ -61,10 +64,19 @@ class Committer:
         self._entries: Entries
         self._failed: Batch | None = None
         self._is_writing = False
+        #: Bytes of what links keep in the batch that is being written.
+        self._writing = 0
         self._is_running = False
         self._timer: asyncio.TimerHandle | None = None
+        #: Whether that is for the next round of the event loop.
+        self._is_due = False
         self._notify: Callable[[bool], None] = lambda committed: None
         self._outcome: asyncio.Future[None] | None = None
+
+    @property
+    def unwritten(self) -> int:
+        """Bytes of what links keep that are only in memory, but for a batch that has failed."""
+        return self.open.bytes + self._writing
 
     @property
     def is_idle(self) -> bool:
@@ -138,13 +150,21 @@ class Committer:
         self.stage_lazily()
 
     def stage_lazily(self) -> None:
-        """Nothing depends on what was put: it is committed with what follows, or after `LINGER`."""
+        """Nothing depends on what was put: it is committed with what follows, or after `LINGER`;
+        when much was put, in the next round of the event loop."""
         self.open.is_changed = True
-        if self._timer is None and self._is_running and not self._is_writing:
-            delay = RETRY if self.failing else LINGER
-            self._timer = self._entries.later(
-                "store.write", delay, self._commit_in_time, failed=self._commit_later
-            )
+        if not self._is_running or self._is_writing:
+            return
+        is_large = self.open.bytes >= LARGE and not self.failing
+        if self._timer is not None:
+            if not is_large or self._is_due:
+                return
+            self._timer.cancel()
+        self._is_due = is_large
+        delay = 0.0 if is_large else RETRY if self.failing else LINGER
+        self._timer = self._entries.later(
+            "store.write", delay, self._commit_in_time, failed=self._commit_later
+        )
 
     def _commit_later(self) -> None:
         self._timer = None
@@ -168,6 +188,7 @@ class Committer:
         self._state.batch += 1
         self.open = Batch(self._state.batch, next(self.keys))
         self._is_writing = True
+        self._writing = batch.bytes
         self._writer.write(batch)
 
     def _written(self, batch: Batch, error: Exception | None) -> None:
@@ -179,6 +200,7 @@ class Committer:
 
     def _done(self, batch: Batch, error: Exception | None) -> None:
         self._is_writing = False
+        self._writing = 0
         try:
             self._settle(batch, error)
         finally:  # whatever went wrong with this batch, the next one is written

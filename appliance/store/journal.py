@@ -95,6 +95,7 @@ class StoredJournal:
         if segment is None or segment.size + size > SEGMENT_SIZE:
             segment = self._begin(now)
         self._records.append(record)
+        self._committer.open.bytes += size
         self._held.add(segment.key)
         segment.count += 1
         segment.size += size

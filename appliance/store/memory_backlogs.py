@@ -130,6 +130,7 @@ class MemoryBacklogs(LinkBacklogs[MemoryJournal, MemoryLatestRecords, MemorySing
     """`Backlogs` in memory; `soon` calls in a later round of the event loop."""
 
     failing = False
+    unwritten = 0
 
     def __init__(self, soon: Soon, now: Callable[[], float]) -> None:
         super().__init__()

@@ -54,6 +54,7 @@ class StoredSingleRecords:
         batch.segments[key] = UnwrittenSegment(key, self._link, SINGLE_LANE, now, now, [record])
         batch.put(Table.SEGMENT, key, (key, self._link, SINGLE_LANE, 1, len(record), 0, now, now))
         batch.messages += 1
+        batch.bytes += len(record)
         self._keys.add(key)
         self._uncommitted[key] = record
         self._committing.append((batch.number, key))

@@ -36,6 +36,7 @@ class Batch:
     """
 
     __slots__ = (
+        "bytes",
         "deleted",
         "first_id",
         "has_dependents",
@@ -57,8 +58,10 @@ class Batch:
         self.segments: dict[int, UnwrittenSegment] = {}
         #: Put the last rows into the batch, when it is handed over.
         self.sealers: list[Callable[[Batch], None]] = []
-        #: Messages that were staged, including those that were deleted again.
+        #: Messages that were staged, including those that were deleted again; of what links keep,
+        #: also the bytes.
         self.messages = 0
+        self.bytes = 0
         #: Something was staged, beside what the start itself has changed.
         self.is_changed = False
         #: Packets may depend on it: they are sent when it is committed.
@@ -104,6 +107,7 @@ class Batch:
         self.segments.update(newer.segments)
         self.number = newer.number
         self.messages += newer.messages
+        self.bytes += newer.bytes
 
 
 #: Called on the writer's thread after each batch, with the error, if any.

@@ -93,6 +93,10 @@ IN_FLIGHT_RESERVE: Final = 256 * KIB
 #: Bytes of read records that a rule has at least, however many rules there are.
 LOADED_SHARE: Final = 32 * KIB
 
+#: Bytes that may wait to be written for all links, by lane: with more, no message of QoS 0 is
+#: stored, as nothing else slows down who publishes them.
+UNWRITTEN_SIZE: Final = (16 * MIB, 12 * MIB, 8 * MIB)
+
 #: After so many messages of other lanes it is a lane's turn. Both lower lanes may have waited, so
 #: that each gets one in 16.
 TURN: Final = 14
@@ -139,6 +143,7 @@ class DropReason(Enum):
     FULL = "full"  # the backlog, or its part of the memory
     REFUSED = "refused"  # as it is full; the publisher was told
     STORE = "store"  # nothing can be stored now; the publisher was told
+    DISK = "disk"  # of QoS 0, as more came than the disk takes
     AGE = "age"
     EXPIRED = "expired"
     REPLACED = "replaced"  # by a newer one of its topic
@@ -458,6 +463,8 @@ class Backlog:
         if kept == "none" and not self._online:
             self._drop(queue, DropReason.OFFLINE)
             return None
+        if kept == "all" and not qos and self._is_behind_disk(queue):
+            return None
         self._number = number = self._number + 1
         data = encode_record(
             number,
@@ -494,6 +501,8 @@ class Backlog:
                     return self._refuse(queue)
             if (persistent or not in_memory) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
+            if not (qos or in_memory) and self._is_behind_disk(queue):
+                return None
             expires = math.inf if expires_at is None else expires_at
             value = LatestValue(topic, number, qos, size, now, expires)
             self._offer_latest(queue, value, data, persistent=persistent, in_memory=in_memory)
@@ -533,6 +542,13 @@ class Backlog:
     def _cannot_store(self, queue: RuleQueue, qos: int) -> str | None:
         self._drop(queue, DropReason.STORE)
         return f"the backlog of {self._name} cannot be stored" if qos else None
+
+    def _is_behind_disk(self, queue: RuleQueue) -> bool:
+        """Drop a message of QoS 0 when more waits to be written than the memory allows."""
+        if self._backlogs.unwritten < UNWRITTEN_SIZE[queue.lane]:
+            return False
+        self._drop(queue, DropReason.DISK)
+        return True
 
     def _append(
         self, queue: RuleQueue, topic: str, data: bytes, number: int, *, awaited: bool

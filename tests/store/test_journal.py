@@ -80,6 +80,27 @@ async def test_a_batch_is_a_segment(harness: Harness) -> None:
     ]
 
 
+async def test_much_of_which_nobody_waits_for_anything_is_written_at_once(
+    harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(committer, "LINGER", 1000.0)
+    await harness.written()
+    backlogs, journal = harness.store.backlogs, opened(harness)
+    journal.append(bytes(1000), awaited=False)
+    assert backlogs.unwritten == 1000
+    for _ in range(3):
+        journal.append(bytes(committer.LARGE // 2), awaited=False)
+    backlogs.single("fleet").put(bytes(500), awaited=False)
+    assert backlogs.unwritten == 1500 + 3 * committer.LARGE // 2
+    await until(lambda: not backlogs.unwritten, "the commit")
+    for _ in range(3):  # as much as this while it is written is written next
+        journal.append(bytes(committer.LARGE // 2), awaited=False)
+        harness.store._committer.commit()
+        journal.append(bytes(committer.LARGE), awaited=False)
+        assert backlogs.unwritten == 3 * committer.LARGE // 2
+        await until(lambda: not backlogs.unwritten, "both commits")
+
+
 async def test_a_large_batch_is_several(harness: Harness) -> None:
     journal = opened(harness)
     records = [bytes([number]) * 50_000 for number in range(20)]

@@ -132,6 +132,7 @@ class PlainBacklogs:
     def __init__(self, segment_size: int = 256 * 1024) -> None:
         self.segment_size = segment_size
         self.failing = False
+        self.unwritten = 0
         self.time = 1000.0
         self.keys = 0
         self.reads = 0

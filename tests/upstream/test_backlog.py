@@ -10,7 +10,14 @@ import pytest
 from appliance.broker.backlogs import RecordsLostError
 from appliance.mqtt.codec import NO_PROPERTIES
 from appliance.upstream import backlog as module
-from appliance.upstream.backlog import MOST_LATER, Backlog, BacklogCounts, DropReason
+from appliance.upstream.backlog import (
+    LATEST_SIZE,
+    MOST_LATER,
+    UNWRITTEN_SIZE,
+    Backlog,
+    BacklogCounts,
+    DropReason,
+)
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
 from appliance.upstream.set_aside import ASIDE_SIZE
@@ -427,6 +434,28 @@ def test_what_cannot_be_stored_is_refused() -> None:
     assert link.offer("3", qos=0) is None
     assert link.drain() == ["3"]
     assert link.dropped() == {"store": 2}
+
+
+def test_no_more_of_qos_0_is_taken_than_the_disk_takes() -> None:
+    """What is acknowledged waits for the disk; of the rest, a higher lane may have more wait."""
+    rules = rule(keep="all"), rule("l", "all", "low"), rule("t", "latest")
+    link = Link(*rules, online=False)
+    link.offer("before", qos=0)
+    link.backlogs.unwritten = UNWRITTEN_SIZE[2]
+    link.offer("low", qos=0, of=1)
+    link.offer("normal", qos=0)
+    link.backlogs.unwritten = UNWRITTEN_SIZE[1]
+    link.offer("normal as well", qos=0)
+    link.offer("acknowledged", qos=1, of=1)
+    link.offer("in memory", qos=0, of=2)
+    large = "x" * LATEST_SIZE
+    link.offer(large, "large", qos=0, of=2)
+    assert link.dropped() == {"disk": 3}
+    link.backlogs.unwritten = 0
+    link.offer(large, "large", qos=0, of=2)
+    link.backlog.connected()
+    sent = link.drain()
+    assert sorted(sent) == sorted(["before", "normal", "acknowledged", "in memory", large])
 
 
 @pytest.mark.parametrize("commits", [2, 7, 1000])
