@@ -62,6 +62,16 @@ IN: Sequence[Mapping[str, Any]] = (
 )
 
 
+def links(config: Path) -> list[dict[str, Any]]:
+    """What `appliance upstream` says; AssertionError when it does not answer."""
+    command = [sys.executable, "-m", "appliance", "upstream", "--json", "-c", str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    # 1: a link is down.
+    assert done.returncode in (0, 1) and done.stdout, f"{' '.join(command)}: {done.stderr}"
+    found: list[dict[str, Any]] = json.loads(done.stdout)
+    return found
+
+
 class Device(ABC):
     """What is tried."""
 
@@ -159,14 +169,7 @@ class ApplianceDevice(Device):
 
     def status(self) -> dict[str, Any] | None:
         """AssertionError when the command fails: it has to answer whenever the appliance runs."""
-        command = [sys.executable, "-m", "appliance", "upstream", "--json"]
-        command += ["-c", str(self.process.config)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-        assert not done.returncode, f"{' '.join(command)}: {done.stdout}{done.stderr}"
-        found = json.loads(done.stdout)
-        if isinstance(found, list):
-            (found,) = [each for each in found if each.get("name") == LINK]
-        assert isinstance(found, dict)
+        (found,) = [each for each in links(self.process.config) if each["name"] == LINK]
         return found
 
 

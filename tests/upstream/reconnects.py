@@ -7,9 +7,6 @@ that has just started, all at once.
 from __future__ import annotations
 
 import asyncio
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,7 +18,7 @@ from appliance_process import ApplianceProcess
 from waiting import until
 
 from upstream.client import MqttClient
-from upstream.device import ACL, LIMITS, LINK_USER
+from upstream.device import ACL, LIMITS, LINK_USER, links
 from upstream.kills import Fleet, make_fleet
 from upstream.peers import HOST, PASSWORD, USER, RabbitMQ
 from upstream.streams import version_of
@@ -113,11 +110,7 @@ class Reconnects:
 
         It is online when all that it has sent is acknowledged: its state as well.
         """
-        command = [sys.executable, "-m", "appliance", "upstream", "--json"]
-        command += ["-c", str(self.process.config)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-        assert not done.returncode, done.stdout + done.stderr
-        found = json.loads(done.stdout)
+        found = links(self.process.config)
         now = time.monotonic()
         online = [each for each in found if each["connected"] and not each["inflight"]]
         return [now - each["since"] for each in online]
