@@ -13,7 +13,8 @@ which nobody knows behind a broker:
 A request that goes out gets a token of the link's in the same place.
 
 Tokens are random, so that who may write below `_upstream` or `_answers` cannot guess one. They end
-`LIFETIME` after the last request with that Response Topic; the oldest end when there are too many.
+`LIFETIME` after the last request with that Response Topic. When there are too many, the oldest of
+the user here who has the most end, so that nobody's requests take away the answers of others.
 """
 
 from __future__ import annotations
@@ -45,33 +46,60 @@ def new_token() -> str:
     return secrets.token_hex(16)
 
 
+class _Owned:
+    """The tokens of one user: the oldest comes first."""
+
+    __slots__ = ("bytes", "tokens")
+
+    def __init__(self) -> None:
+        self.tokens: dict[str, None] = {}
+        self.bytes = 0
+
+    def share(self) -> float:
+        """The part of what all may have."""
+        return max(len(self.tokens) / MOST_TOKENS, self.bytes / MOST_BYTES)
+
+
 class _Tokens:
     """Tokens of one direction, each of a topic at the other side."""
 
     def __init__(self, new: Callable[[], str]) -> None:
         self._new = new
-        #: By token: the topic, and when it ends; by topic: the token. The oldest come first.
-        self._topics: dict[str, tuple[str, float]] = {}
+        #: By token: the topic, its owner, and when it ends; by topic: the token. The oldest come
+        #: first.
+        self._topics: dict[str, tuple[str, str | None, float]] = {}
         self._tokens: dict[str, str] = {}
+        #: By user: who asks here; None for anonymous clients, and for all who ask there.
+        self._owned: dict[str | None, _Owned] = {}
         self._bytes = 0
 
     def __len__(self) -> int:
         return len(self._topics)
 
-    def issue(self, topic: str, now: float) -> str:
-        """The token of a topic, which holds for `LIFETIME` from now."""
+    def issue(self, topic: str, now: float, user: str | None = None) -> str:
+        """The token of a topic, which holds for `LIFETIME` from now; `user` is who asks."""
         self._end_old(now)
         token = self._tokens.get(topic)
         if token is None:
             token = self._new()
         else:
             self._end(token)
-        self._topics[token] = topic, now + LIFETIME
+        size = text_size(topic)
+        owned = self._owned.setdefault(user, _Owned())
+        owned.tokens[token] = None
+        owned.bytes += size
+        self._topics[token] = topic, user, now + LIFETIME
         self._tokens[topic] = token
-        self._bytes += text_size(topic)
+        self._bytes += size
         while len(self._topics) > MOST_TOKENS or self._bytes > MOST_BYTES:
-            self._end(next(iter(self._topics)))
+            self._end(next(iter(self._largest(owned).tokens)))
         return token
+
+    def _largest(self, asking: _Owned) -> _Owned:
+        """Whose oldest token ends: who asks, if that is an equal share; else who has the most."""
+        if len(asking.tokens) > 1 and asking.share() * len(self._owned) >= 1:
+            return asking
+        return max(self._owned.values(), key=_Owned.share)
 
     def topic(self, token: str, now: float) -> str | None:
         """The topic of a token; None when there is none, or it has ended."""
@@ -81,15 +109,21 @@ class _Tokens:
 
     def _end_old(self, now: float) -> None:
         while self._topics:
-            token, (_, ends) = next(iter(self._topics.items()))
+            token, (_, _, ends) = next(iter(self._topics.items()))
             if ends > now:
                 return
             self._end(token)
 
     def _end(self, token: str) -> None:
-        topic, _ = self._topics.pop(token)
+        topic, user, _ = self._topics.pop(token)
         del self._tokens[topic]
-        self._bytes -= text_size(topic)
+        size = text_size(topic)
+        self._bytes -= size
+        owned = self._owned[user]
+        del owned.tokens[token]
+        owned.bytes -= size
+        if not owned.tokens:
+            del self._owned[user]
 
 
 class Answers:
@@ -120,24 +154,26 @@ class Answers:
         """The topic there of an answer that was published here; None when it is for nobody."""
         return self._topic(self._coming, self._here, topic, now)
 
-    def for_request_out(self, response_topic: str, now: float) -> str | None:
-        """The Response Topic there of a request that goes out; None when it is invalid.
+    def for_request_out(self, response_topic: str, now: float, user: str | None) -> str | None:
+        """The Response Topic there of a user's request that goes out; None when it is invalid.
 
         Whoever calls this has checked that the requester itself may publish to its Response Topic:
         the answer is published by the link's user.
         """
         if not _may_be_answered(response_topic):
             return None
-        return self._there + self._going.issue(response_topic, now)
+        return self._there + self._going.issue(response_topic, now, user)
 
-    def for_call_out(self, topic: str, response_topic: str, now: float) -> str | None:
+    def for_call_out(
+        self, topic: str, response_topic: str, now: float, user: str | None
+    ) -> str | None:
         """With MQTT 3.1.1, the topic there of a request that goes out: with a token of its own.
 
         `topic` is the topic there without it. None: it is no call, and cannot say where to answer.
         """
         if not _is_call(topic) or not _may_be_answered(response_topic):
             return None
-        called = f"{topic}/{self._going.issue(response_topic, now)}"
+        called = f"{topic}/{self._going.issue(response_topic, now, user)}"
         return called if len(called.encode()) <= MAX_TOPIC else None
 
     def for_answer_in(self, topic: str, now: float) -> str | None:

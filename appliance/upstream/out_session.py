@@ -277,11 +277,12 @@ class OutSession:
         """The topic and properties there of a request: its answer comes to the link."""
         now = self._broker.now
         response_topic: str | None = None
-        if self._may_be_answered(publisher, wanted):
+        if publisher is not None and self._may_be_answered(publisher, wanted):
+            user = publisher.account.username
             if self.version == V5:
-                response_topic = self._answers.for_request_out(wanted, now)
+                response_topic = self._answers.for_request_out(wanted, now, user)
             else:
-                called = self._answers.for_call_out(topic, wanted, now)
+                called = self._answers.for_call_out(topic, wanted, now, user)
                 if called is not None:
                     return called, properties
         properties = dict(properties)
@@ -292,12 +293,12 @@ class OutSession:
             properties[Property.RESPONSE_TOPIC] = response_topic
         return topic, properties
 
-    def _may_be_answered(self, publisher: Session | None, topic: str) -> bool:
+    def _may_be_answered(self, publisher: Session, topic: str) -> bool:
         """Whether the requester may publish to its Response Topic, where the answer will be.
 
         A topic with a guard is one of commands to ROS: no answer may be one.
         """
-        if publisher is None or topic in self._broker.guards:
+        if topic in self._broker.guards:
             return False
         try:
             return self._broker.route(publisher, encode_string(topic)).allowed

@@ -38,7 +38,7 @@ def test_a_request_from_there_is_answered_there(answers: Answers) -> None:
 
 
 def test_a_request_from_here_is_answered_here(answers: Answers) -> None:
-    there = answers.for_request_out("clients/bob/answers", 0.0)
+    there = answers.for_request_out("clients/bob/answers", 0.0, "bob")
     assert there == "fleet/r2/_answers/t0"
     assert answers.for_answer_in(there, 1.0) == "clients/bob/answers"
     for other in ("fleet/r2/_answers/t1", "fleet/r3/_answers/t0", "fleet/r2/_answers/t0/x"):
@@ -85,11 +85,38 @@ def test_long_response_topics_do_not_fill_the_memory(answers: Answers) -> None:
         assert last is not None and answers.for_answer_out(last, 0.0) is not None
 
 
+@pytest.mark.parametrize("long", [False, True])
+def test_requests_of_one_user_do_not_take_away_the_answers_of_others(
+    answers: Answers, long: bool
+) -> None:
+    def ask(user: str, number: int) -> str:
+        topic = f"{user}/{number}/" + ("x" * 60_000 if long and user == "mallory" else "")
+        there = answers.for_request_out(topic, 0.0, user)
+        assert there is not None
+        return there
+
+    def is_answered(there: str) -> bool:
+        return answers.for_answer_in(there, 0.0) is not None
+
+    of_alice = [ask("alice", number) for number in range(100)]
+    first = ask("mallory", 0)
+    for number in range(1, 200 if long else MOST_TOKENS + 200):
+        last = ask("mallory", number)
+    of_bob = [ask("bob", number) for number in range(100)]
+    assert all(map(is_answered, [*of_alice, *of_bob]))
+    assert is_answered(last) and not is_answered(first)
+    assert len(answers) <= MOST_TOKENS
+    for number in range(MOST_TOKENS):  # an equal share of three
+        ask("bob", 100 + number)
+    kept = sum(len(answers._going._owned[user].tokens) for user in ("alice", "mallory"))
+    assert kept >= 100 + (130 if long else MOST_TOKENS // 3)
+
+
 @pytest.mark.parametrize("topic", ["", "a/#", "+", "$SYS/x", "$CONTROL/a", "a\nb", "x" * 65_536])
 def test_response_topics_that_nobody_may_use(answers: Answers, topic: str) -> None:
     assert answers.for_request_in("x/_call/7", topic, 0.0) is None
-    assert answers.for_request_out(topic, 0.0) is None
-    assert answers.for_call_out("fleet/r2/x/_call", topic, 0.0) is None
+    assert answers.for_request_out(topic, 0.0, "bob") is None
+    assert answers.for_call_out("fleet/r2/x/_call", topic, 0.0, "bob") is None
     assert len(answers) == 0
 
 
@@ -105,7 +132,7 @@ CALLS = [
 @pytest.mark.parametrize(("call", "reply"), CALLS)
 def test_calls_of_3_1_1_have_a_token(answers: Answers, call: str, reply: str) -> None:
     """Both ways: what one appliance asks for, another answers."""
-    called = answers.for_call_out(call, "clients/bob", 0.0)
+    called = answers.for_call_out(call, "clients/bob", 0.0, "bob")
     assert called == f"{call}/t0"
     other = Answers(link(""))
     here = other.for_request_in(called, None, 0.0)
@@ -135,7 +162,7 @@ def test_calls_of_3_1_1_have_a_token(answers: Answers, call: str, reply: str) ->
 def test_what_is_no_call_of_3_1_1(answers: Answers, topic: str) -> None:
     assert reply_topic(topic) is None
     assert answers.for_request_in(topic, None, 0.0) is None
-    assert answers.for_call_out(topic.rpartition("/")[0] + "x", "clients/bob", 0.0) is None
+    assert answers.for_call_out(topic.rpartition("/")[0] + "x", "clients/bob", 0.0, "bob") is None
 
 
 def test_a_topic_of_many_levels_is_cheap_to_look_at() -> None:
