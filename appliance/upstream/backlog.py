@@ -1432,9 +1432,12 @@ class Backlog:
         entry.queue.later += count
 
     def hold(self, entry: Entry, packet_size: int) -> bool:
-        """The fleet's broker takes only smaller packets now: keep it until one takes more, and send
-        what follows. False for what only counts as long as nothing newer has come, or is not
-        stored, and where too much is kept so."""
+        """The fleet's broker takes only smaller packets now: keep it until one takes more than
+        `packet_size` bytes, and send what follows.
+
+        False for what only counts as long as nothing newer has come, or is not stored, and where
+        too much is kept so.
+        """
         if entry.topic is not None or (entry.part is None and entry.key is None):
             return False
         held = self._orphaned(HELD)

@@ -161,7 +161,9 @@ class Sender:
             why = limits.unsendable(topic, size)
             # The kind of broker never takes it; or this connection, and perhaps a later one does.
             is_for_now = not self._of_kind.unsendable(topic, size)
-            if is_for_now and self._backlog.hold(entry, limits.packet_size):
+            # With a limit below its payload it need not be tried again: each try writes it anew.
+            too_small = max(limits.packet_size, len(payload))
+            if is_for_now and self._backlog.hold(entry, too_small):
                 return
             self._set_aside(entry, f"the fleet's broker does not take it: {why}")
             return

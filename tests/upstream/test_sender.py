@@ -38,9 +38,11 @@ def sender_of(link: Link) -> Sender:
     return Sender(settings_of(), link.backlog, lambda: link.backlogs.time, FleetLimits())
 
 
-def send(link: Link, sender: Sender | None = None) -> list[tuple[str, int, object]]:
+def send(
+    link: Link, sender: Sender | None = None, limits: FleetLimits | None = None
+) -> list[tuple[str, int, object]]:
     sender = sender or sender_of(link)
-    sender.begin(FleetLimits())
+    sender.begin(limits or FleetLimits())
     connection = Connection()
     while sender.send(connection) or link.backlogs.rounds:  # type: ignore[arg-type]
         link.backlogs.turn()
@@ -99,6 +101,34 @@ def test_only_short_topics_are_remembered() -> None:
     sender = sender_of(link)
     assert [topic for topic, *_ in send(link, sender)] == topics
     assert list(sender._topics) == topics[:4]
+
+
+def test_what_is_too_large_is_not_written_anew_with_each_limit_that_is_a_byte_more() -> None:
+    link = Link(OutRule("#", "r/", "fleet/", "all", qos=0))
+    for size in (3_000, 2_000, 10):
+        link.offer("x" * size, f"{size}")
+    sender, backlog = sender_of(link), link.backlog
+    held: list[str] = []
+    hold = backlog.hold
+
+    def noted(entry: Entry, packet_size: int) -> bool:
+        held.append(entry.record.topic)
+        return hold(entry, packet_size)
+
+    backlog.hold = noted  # type: ignore[method-assign]
+
+    def sent(limit: int) -> list[str]:
+        backlog.rewind()
+        backlog.connected(limit)
+        return [topic for topic, *_ in send(link, sender, FleetLimits(packet_size=limit))]
+
+    assert sent(1_000) == ["10"] and held == ["3000", "2000"]
+    for limit in range(1_001, 2_001, 37):
+        assert sent(limit) == []
+    assert held == ["3000", "2000"]
+    assert sent(2_100) == ["2000"] and held == ["3000", "2000", "3000"]
+    assert sent(2_200) == [] and len(held) == 3
+    assert sent(3_100) == ["3000"] and len(held) == 3
 
 
 def test_a_flood_that_is_refused_is_not_a_flood_of_lines(caplog: pytest.LogCaptureFixture) -> None:
