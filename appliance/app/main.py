@@ -156,6 +156,7 @@ class App:
             limits.of_broker(),
             broker_settings.features(),
         )
+        broker.router.reserved += (f"{settings.robot}/_appliance/",)
         self._entries = Entries(loop, broker.faults)
         if self._crashes is not None:
             broker.faults.report = self._crashes.fault

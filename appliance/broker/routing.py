@@ -72,6 +72,8 @@ class Router:
         self.pending_decisions: PendingDecisions | None = None
         #: The pending decisions of the route that is being looked up.
         self._undecided: list[AccessQuery] | None = None
+        #: What topics begin with that only the appliance itself publishes, whatever the rules say.
+        self.reserved: tuple[str, ...] = ("$",)
         #: By topic, the parts of the appliance that restrict who may publish to it.
         self.guards: dict[str, list[PublishGuard]] = {}
         #: Incremented whenever a cached route may be outdated.
@@ -190,9 +192,9 @@ class Router:
         excess = self.excess(topic)
         if excess:  # [MQTT-4.13.1-1]; as mosquitto does
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic with {excess}")
-        if topic.startswith("$"):  # [MQTT-4.7.2-1]: for the server's own use
-            reason = "topics that begin with $ are the broker's own"
-            return Decision(False, reason)
+        for beginning in self.reserved:  # [MQTT-4.7.2-1]: for the server's own use
+            if topic.startswith(beginning):
+                return Decision(False, f"topics that begin with {beginning} are the broker's own")
         return self.decide(session.identity, Action.PUBLISH, topic)
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:

@@ -171,6 +171,9 @@ def acl_explain(
     except ValueError as error:
         raise typer.BadParameter(f"{topic!r}: {error}") from None
     typer.echo(str(explanation))
+    if topic.startswith(("$", f"{settings.robot}/_appliance/")) and not topic.startswith("$share/"):
+        note = "note: nobody may publish there: what the appliance says of itself is its own"
+        typer.secho(note, fg="yellow", err=True)
     with suppress(AccessFileError):
         users = Passwords.load(settings.broker.users)
         if user and user not in users.users():

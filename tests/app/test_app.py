@@ -98,7 +98,9 @@ def test_it_says_that_it_is_online_and_refuses_what_is_the_brokers_own(process) 
     state = alice.read()
     assert isinstance(state, Publish)
     assert (state.payload, state.retain) == (b"online", True)
-    assert alice.publish("$SYS/broker/version") == ReasonCode.NOT_AUTHORIZED
+    for topic in ("$SYS/broker/version", "r2d2/_appliance/state", "r2d2/_appliance/upstream/x"):
+        assert alice.publish(topic) == ReasonCode.NOT_AUTHORIZED
+    assert alice.publish("r2d2/_appliances") == ReasonCode.NO_MATCHING_SUBSCRIBERS
     alice.close()
 
 

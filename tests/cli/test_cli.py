@@ -293,6 +293,8 @@ def test_acl_explain(output: pytest.CaptureFixture[str]) -> None:
     assert "no user" not in output.readouterr().err
     assert run("acl", "explain", "alcie", "r2/odom") == 0
     assert "note: there is no user 'alcie' in users.passwd" in output.readouterr().err
+    assert run("acl", "explain", "alice", "r2/_appliance/state") == 0
+    assert "note: nobody may publish there" in output.readouterr().err
 
 
 def test_the_client_needs_a_password(
