@@ -254,7 +254,9 @@ class RuleQueue:
             and segment is not self.reading
             and (self.last is None or segment is not self.last.segment)
         ):
-            if self.spilled is not None and self.journal is not None:
+            # Not while its records may yet be kept in memory: it would be merged under them.
+            is_arriving = any(place is self.spilled for place, _, _ in self.arriving or ())
+            if self.spilled is not None and self.journal is not None and not is_arriving:
                 self.journal.release(self.spilled)
             self.spilled = segment
 

@@ -18,7 +18,7 @@ from appliance.upstream.backlog import (
     BacklogCounts,
     DropReason,
 )
-from appliance.upstream.rule_queue import Entry
+from appliance.upstream.rule_queue import LOADED_OVERHEAD, Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
 from appliance.upstream.set_aside import ASIDE_SIZE
 from upstream.plain_backlogs import PlainBacklogs
@@ -409,6 +409,31 @@ def test_full_of_what_is_more_urgent_the_message_itself_goes() -> None:
     assert link.offer("x" * 6_000, of=0) is None
     assert link.counts().waiting == waiting
     assert link.counts().dropped["r/h", DropReason.FULL] == 2
+
+
+@pytest.mark.parametrize("room", range(2, 8))
+def test_what_comes_while_a_segment_is_read_is_not_merged_before_it_is_in_memory(
+    room: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is slow: three batches come, and memory has room for a part of them."""
+    link = Link(rule(keep="all"))
+    for number in range(3):
+        link.offer(f"{number}")
+    link.backlogs.commit()
+    size = link.counts().bytes // 3 + LOADED_OVERHEAD
+    monkeypatch.setattr(module, "LOADED_SIZE", room * size)
+    monkeypatch.setattr(module, "LOADED_SHARE", 0)
+    link.restart()
+    assert (
+        link.backlog.next(link.backlogs.time) is None and link.backlogs.rounds
+    )  # it is being read
+    for number in range(3, 6):
+        link.offer(f"{number}")
+        link.backlogs.commit()
+    for journal in link.backlogs.journals.values():
+        journal.merge()
+    assert link.drain() == [str(number) for number in range(6)]
+    assert link.counts().waiting == 0
 
 
 def test_full_and_refuse(caplog: pytest.LogCaptureFixture) -> None:
