@@ -47,6 +47,7 @@ from struct import Struct
 from typing import Final
 
 from appliance.broker.backlogs import NO_MESSAGE, Backlogs, RecordsLostError, Segment
+from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.upstream.latest_values import LatestValue
 from appliance.upstream.rates import TokenBucket
 from appliance.upstream.records import Record, encode_record, record_head, record_times
@@ -246,6 +247,7 @@ class Backlog:
         #: what was settled there out of order was not stored.
         self._repeated: set[int] = set()
         self._full_since: int | None = None
+        self._log = RateLimitedLog()
         self._counts = BacklogCounts()
         #: The bytes of a packet at which all held messages are known to be too large; and at which
         #: those were that have not been handed out on this connection, which takes more.
@@ -463,7 +465,7 @@ class Backlog:
         if kept == "none" and not self._online:
             self._drop(queue, DropReason.OFFLINE)
             return None
-        if kept == "all" and not qos and self._is_behind_disk(queue):
+        if kept == "all" and not qos and self._is_behind_disk(queue, now):
             return None
         self._number = number = self._number + 1
         data = encode_record(
@@ -501,7 +503,7 @@ class Backlog:
                     return self._refuse(queue)
             if (persistent or not in_memory) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
-            if not (qos or in_memory) and self._is_behind_disk(queue):
+            if not (qos or in_memory) and self._is_behind_disk(queue, now):
                 return None
             expires = math.inf if expires_at is None else expires_at
             value = LatestValue(topic, number, qos, size, now, expires)
@@ -543,11 +545,13 @@ class Backlog:
         self._drop(queue, DropReason.STORE)
         return f"the backlog of {self._name} cannot be stored" if qos else None
 
-    def _is_behind_disk(self, queue: RuleQueue) -> bool:
+    def _is_behind_disk(self, queue: RuleQueue, now: float) -> bool:
         """Drop a message of QoS 0 when more waits to be written than the memory allows."""
         if self._backlogs.unwritten < UNWRITTEN_SIZE[queue.lane]:
             return False
         self._drop(queue, DropReason.DISK)
+        text = "the backlog of %s: the disk is too slow for %s, messages of QoS 0 are dropped"
+        self._log.warning(now, queue.name, text, self._name, queue.name, burst=1)
         return True
 
     def _append(
@@ -853,6 +857,7 @@ class Backlog:
 
     def tick(self, now: float) -> None:
         """Drop what has become too old; to be called every second or so."""
+        self._log.tick(now)
         for queue in self._queues.values():
             self._drop_outdated(queue, now)
         self._drop_outdated_latest(now)

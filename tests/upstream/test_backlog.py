@@ -461,7 +461,7 @@ def test_what_cannot_be_stored_is_refused() -> None:
     assert link.dropped() == {"store": 2}
 
 
-def test_no_more_of_qos_0_is_taken_than_the_disk_takes() -> None:
+def test_no_more_of_qos_0_is_taken_than_the_disk_takes(caplog: pytest.LogCaptureFixture) -> None:
     """What is acknowledged waits for the disk; of the rest, a higher lane may have more wait."""
     rules = rule(keep="all"), rule("l", "all", "low"), rule("t", "latest")
     link = Link(*rules, online=False)
@@ -476,6 +476,7 @@ def test_no_more_of_qos_0_is_taken_than_the_disk_takes() -> None:
     large = "x" * LATEST_SIZE
     link.offer(large, "large", qos=0, of=2)
     assert link.dropped() == {"disk": 3}
+    assert len(caplog.records) == 3 and "the disk is too slow for r/l" in caplog.text  # one a rule
     link.backlogs.unwritten = 0
     link.offer(large, "large", qos=0, of=2)
     link.backlog.connected()
