@@ -109,16 +109,20 @@ class World:
     """A Master on a port of its own, to be started and killed, and what is run beside it."""
 
     def __init__(self, directory: Path) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
         self.directory = directory
         self.environment = {
-            "ROS_MASTER_URI": f"http://127.0.0.1:{self.port}",
             "ROS_HOSTNAME": "127.0.0.1",
             "ROS_LOG_DIR": str(directory / "log"),
             "PYTHONUNBUFFERED": "1",
         }
+        self._choose_port()
+        self._has_answered = False
         self._master: subprocess.Popen[bytes] | None = None
+
+    def _choose_port(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self.environment["ROS_MASTER_URI"] = f"http://127.0.0.1:{self.port}"
 
     @property
     def for_ros(self) -> dict[str, str]:
@@ -128,14 +132,30 @@ class World:
         return environment
 
     def start(self) -> None:
-        """`roscore`, which starts the Master and rosout."""
+        """`roscore`, which starts the Master and rosout; later on the same port again."""
+        for _ in range(5):
+            master = self._launch()
+            eventually(
+                lambda: master.poll() is not None or self._answers(),  # noqa: B023
+                "the Master is there, or could not be started",
+                2 * PATIENCE,
+            )
+            if master.poll() is None:
+                self._has_answered = True
+                return
+            self._master = None
+            if not self._has_answered:  # another program has taken the port since
+                self._choose_port()
+        raise AssertionError("the Master could not be started")
+
+    def _launch(self) -> subprocess.Popen[bytes]:
         self._master = subprocess.Popen(
             ["roscore", "-p", str(self.port)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env=self.for_ros,
         )
-        eventually(self._answers, "the Master is there", 2 * PATIENCE)
+        return self._master
 
     def _answers(self) -> bool:
         with socket.socket() as probe:
