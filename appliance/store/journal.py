@@ -172,6 +172,8 @@ class StoredJournal:
         segment = self._segments.pop(place)
         key = segment.key
         batch = self._committer.open
+        if key in self._appended:
+            batch.bytes -= segment.size
         batch.remove(Table.SEGMENT, key)
         batch.remove_records(key)
         self._forget(key)
@@ -281,7 +283,8 @@ class StoredJournal:
         """Look at segments since the last time, and merge neighbours that are small."""
         first = bisect_left(self._segments, self._looked_at + 1, key=_key)
         for segment in self._segments[first : first + LOOKED_AT]:
-            if segment.key in self._uncommitted:
+            # The last one is in use until the next one is there.
+            if segment.key in self._uncommitted or segment is self._segments[-1]:
                 return
             self._looked_at = segment.key
             if self._may_be_merged(segment):
@@ -317,5 +320,6 @@ class StoredJournal:
         self._segments[first : first + len(run)] = [merged]
         self._uncommitted[key] = outcome
         self._appended[key] = merged
+        batch.bytes += size
         self._touch()
         self._committer.stage_lazily()

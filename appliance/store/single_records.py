@@ -68,8 +68,10 @@ class StoredSingleRecords:
         """See `SingleRecords`."""
         if key in self._keys:
             self._keys.remove(key)
-            self._uncommitted.pop(key, None)
+            record = self._uncommitted.pop(key, None)
             batch = self._committer.open
+            if record is not None and key in batch.segments:
+                batch.bytes -= len(record)
             batch.remove(Table.SEGMENT, key)
             batch.remove_records(key)
             self._committer.stage_lazily()

@@ -65,10 +65,10 @@ class _Tokens:
 
     def __init__(self, new: Callable[[], str]) -> None:
         self._new = new
-        #: By token: the topic, its owner, and when it ends; by topic: the token. The oldest come
-        #: first.
+        #: By token: the topic, its owner, and when it ends; by topic and owner: the token. The
+        #: oldest come first.
         self._topics: dict[str, tuple[str, str | None, float]] = {}
-        self._tokens: dict[str, str] = {}
+        self._tokens: dict[tuple[str, str | None], str] = {}
         #: By user: who asks here; None for anonymous clients, and for all who ask there.
         self._owned: dict[str | None, _Owned] = {}
         self._bytes = 0
@@ -79,7 +79,7 @@ class _Tokens:
     def issue(self, topic: str, now: float, user: str | None = None) -> str:
         """The token of a topic, which holds for `LIFETIME` from now; `user` is who asks."""
         self._end_old(now)
-        token = self._tokens.get(topic)
+        token = self._tokens.get((topic, user))
         if token is None:
             token = self._new()
         else:
@@ -89,7 +89,7 @@ class _Tokens:
         owned.tokens[token] = None
         owned.bytes += size
         self._topics[token] = topic, user, now + LIFETIME
-        self._tokens[topic] = token
+        self._tokens[topic, user] = token
         self._bytes += size
         while len(self._topics) > MOST_TOKENS or self._bytes > MOST_BYTES:
             self._end(next(iter(self._largest(owned).tokens)))
@@ -116,7 +116,7 @@ class _Tokens:
 
     def _end(self, token: str) -> None:
         topic, user, _ = self._topics.pop(token)
-        del self._tokens[topic]
+        del self._tokens[topic, user]
         size = text_size(topic)
         self._bytes -= size
         owned = self._owned[user]

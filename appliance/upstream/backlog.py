@@ -95,7 +95,7 @@ IN_FLIGHT_RESERVE: Final = 256 * KIB
 LOADED_SHARE: Final = 32 * KIB
 
 #: Bytes that may wait to be written for all links, by lane: with more, no message of QoS 0 is
-#: stored, as nothing else slows down who publishes them.
+#: stored. What is acknowledged is bounded by the backlog's size.
 UNWRITTEN_SIZE: Final = (16 * MIB, 12 * MIB, 8 * MIB)
 
 #: After so many messages of other lanes it is a lane's turn. Both lower lanes may have waited, so
@@ -465,8 +465,6 @@ class Backlog:
         if kept == "none" and not self._online:
             self._drop(queue, DropReason.OFFLINE)
             return None
-        if kept == "all" and not qos and self._is_behind_disk(queue, now):
-            return None
         self._number = number = self._number + 1
         data = encode_record(
             number,
@@ -480,6 +478,11 @@ class Backlog:
             properties_wire,
         )
         size = len(data)
+        is_for_disk = kept == "all" or (
+            kept == "latest" and not self._has_latest_room(queue, topic, size)
+        )
+        if not qos and is_for_disk and self._is_behind_disk(queue, now):
+            return None
         while self._bytes + size > self._limits.size:
             replaced = queue.latest.get(topic) if kept == "latest" else None
             added = size - replaced.size if replaced is not None else size
@@ -503,8 +506,6 @@ class Backlog:
                     return self._refuse(queue)
             if (persistent or not in_memory) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
-            if not (qos or in_memory) and self._is_behind_disk(queue, now):
-                return None
             expires = math.inf if expires_at is None else expires_at
             value = LatestValue(topic, number, qos, size, now, expires)
             self._offer_latest(queue, value, data, persistent=persistent, in_memory=in_memory)
@@ -547,7 +548,7 @@ class Backlog:
 
     def _is_behind_disk(self, queue: RuleQueue, now: float) -> bool:
         """Drop a message of QoS 0 when more waits to be written than the memory allows."""
-        if self._backlogs.unwritten < UNWRITTEN_SIZE[queue.lane]:
+        if self._backlogs.failing or self._backlogs.unwritten < UNWRITTEN_SIZE[queue.lane]:
             return False
         self._drop(queue, DropReason.DISK)
         text = "the backlog of %s: the disk is too slow for %s, messages of QoS 0 are dropped"

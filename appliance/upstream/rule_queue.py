@@ -55,6 +55,16 @@ class HeldSegment:
         self.size = size
         self.settled: set[int] = set()
 
+    def first(self) -> int:
+        """The index of the first record that is in memory, `loaded` if none is: behind those that
+        were handed out, and those of the rest of the segment that were lost."""
+        index = self.next
+        if self.settled or index < self.done:
+            index = max(index, self.done)
+            while index in self.settled:
+                index += 1
+        return index
+
 
 class Entry:
     """A message handed out by `Backlog.next`, until it is settled, set aside or tried again.
@@ -244,6 +254,8 @@ class RuleQueue:
     def _hold(self, segment: Segment, start: int, size: int) -> HeldSegment:
         self.last = held = HeldSegment(segment, start, size)
         self.held.append(held)
+        if self.spilled is segment:
+            self.spilled = None  # it is in memory now, and is not to be released
         return held
 
     def spill(self, segment: Segment) -> None:
@@ -307,10 +319,9 @@ class RuleQueue:
         data = self.waiting.popleft()
         self.loaded -= len(data) + LOADED_OVERHEAD
         part = self.held[0]
-        while part.next == part.loaded:
+        while (index := part.first()) == part.loaded:
             self.held.popleft()
             part = self.held[0]
-        index = part.next
         part.next = index + 1
         return data, part, index
 
@@ -356,7 +367,7 @@ class RuleQueue:
         if last is not None and last.segment is segment:
             count, size = segment.count - last.loaded, segment.size - last.size
             last.settled.update(range(last.loaded, segment.count))
-            last.loaded = last.next = segment.count
+            last.loaded = segment.count
             last.size = segment.size
             self._advance(last)
             self.journal.settle(segment, last.done)

@@ -101,6 +101,20 @@ async def test_much_of_which_nobody_waits_for_anything_is_written_at_once(
         await until(lambda: not backlogs.unwritten, "both commits")
 
 
+async def test_neighbours_are_merged_that_come_one_by_one(harness: Harness) -> None:
+    """As from a backlog: the last segment is released when the next one is there."""
+    journal = opened(harness)
+    last: Segment | None = None
+    for number in range(60):
+        segment = journal.append(bytes([number]) * 10_000)
+        if last is not None:
+            journal.release(last)
+        last = segment
+        await harness.written()
+    await until(lambda: len(journal.segments()) < 25, "merges")
+    assert await unsettled(journal) == [bytes([number]) * 10_000 for number in range(60)]
+
+
 async def test_a_large_batch_is_several(harness: Harness) -> None:
     journal = opened(harness)
     records = [bytes([number]) * 50_000 for number in range(20)]

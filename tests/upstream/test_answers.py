@@ -112,6 +112,14 @@ def test_requests_of_one_user_do_not_take_away_the_answers_of_others(
     assert kept >= 100 + (130 if long else MOST_TOKENS // 3)
 
 
+def test_who_asks_with_the_response_topic_of_another_does_not_own_it(answers: Answers) -> None:
+    there = answers.for_request_out("answers", 0.0, "alice")
+    assert there is not None
+    for number in range(MOST_TOKENS + 10):
+        answers.for_request_out("answers" if not number else f"m/{number}", 0.0, "mallory")
+    assert answers.for_answer_in(there, 0.0) == "answers"
+
+
 @pytest.mark.parametrize("topic", ["", "a/#", "+", "$SYS/x", "$CONTROL/a", "a\nb", "x" * 65_536])
 def test_response_topics_that_nobody_may_use(answers: Answers, topic: str) -> None:
     assert answers.for_request_in("x/_call/7", topic, 0.0) is None

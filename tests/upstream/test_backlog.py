@@ -411,28 +411,74 @@ def test_full_of_what_is_more_urgent_the_message_itself_goes() -> None:
     assert link.counts().dropped["r/h", DropReason.FULL] == 2
 
 
-@pytest.mark.parametrize("room", range(2, 8))
-def test_what_comes_while_a_segment_is_read_is_not_merged_before_it_is_in_memory(
-    room: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("room", range(2, 14))
+@pytest.mark.parametrize("behind", range(4))
+def test_what_is_on_the_way_into_memory_is_not_merged_on_the_disk(
+    room: int, behind: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk is slow: three batches come, and memory has room for a part of them."""
+    """The disk is slow: batches come while one is read and behind that, and memory has room for a
+    part of them."""
+    for during in range(1, 5):
+        link = Link(rule(keep="all"))
+        offered = [f"{number:03}" for number in range(3 + 2 * during + 2 * behind)]
+        wanted = iter(offered)
+
+        def batch(count: int) -> None:
+            for _ in range(count):
+                link.offer(next(wanted))  # noqa: B023
+            link.backlogs.commit()  # noqa: B023
+
+        batch(3)
+        size = link.counts().bytes // 3 + LOADED_OVERHEAD
+        monkeypatch.setattr(module, "LOADED_SIZE", room * size)
+        monkeypatch.setattr(module, "LOADED_SHARE", 0)
+        link.restart()
+        assert link.backlog.next(link.backlogs.time) is None and link.backlogs.rounds  # it is read
+        for _ in range(during):
+            batch(2)
+        if behind:
+            link.backlogs.turn()
+        for _ in range(behind):
+            batch(2)
+        for journal in link.backlogs.journals.values():
+            journal.merge()
+        assert link.drain() == offered
+        assert link.counts().waiting == 0
+
+
+@pytest.mark.parametrize("more", [0, 4])
+@pytest.mark.parametrize("room", range(3, 9))
+def test_the_rest_of_a_segment_is_damaged_of_which_a_part_is_in_memory(
+    room: int, more: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     link = Link(rule(keep="all"))
-    for number in range(3):
-        link.offer(f"{number}")
-    link.backlogs.commit()
-    size = link.counts().bytes // 3 + LOADED_OVERHEAD
+    for number in range(10 + more):
+        link.offer(f"{number:03}")
+        if number in (9, 9 + more):
+            link.backlogs.commit()
+    size = link.counts().bytes // (10 + more) + LOADED_OVERHEAD
     monkeypatch.setattr(module, "LOADED_SIZE", room * size)
     monkeypatch.setattr(module, "LOADED_SHARE", 0)
     link.restart()
-    assert (
-        link.backlog.next(link.backlogs.time) is None and link.backlogs.rounds
-    )  # it is being read
-    for number in range(3, 6):
-        link.offer(f"{number}")
-        link.backlogs.commit()
-    for journal in link.backlogs.journals.values():
-        journal.merge()
-    assert link.drain() == [str(number) for number in range(6)]
+    assert link.backlog.next(link.backlogs.time) is None
+    link.backlogs.turn()
+    sent = [link.backlog.next(link.backlogs.time)]
+    link.backlogs.failures.append(RecordsLostError("for the test"))
+    while (entry := link.backlog.next(link.backlogs.time)) is not None or link.backlogs.rounds:
+        link.backlogs.turn()
+        if entry is not None:
+            sent.append(entry)
+    found = [entry.record.payload.decode() for entry in sent if entry is not None]
+    assert found == sorted(found)
+    assert found[len(found) - more :] == [f"{10 + each:03}" for each in range(more)]
+    lost = link.dropped()["unreadable"]
+    assert len(found) + lost == 10 + more and lost >= 1
+    for entry in reversed(sent):
+        assert entry is not None
+        link.backlog.settle(entry)
+    assert link.counts().waiting == link.counts().bytes == 0
+    link.backlogs.commit()
+    link.restart()
     assert link.counts().waiting == 0
 
 
