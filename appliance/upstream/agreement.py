@@ -104,6 +104,22 @@ class EndedBy(Enum):
     NETWORK = "the network"
 
 
+#: Reason codes of DISCONNECT that may be about a message or a subscription that is not allowed.
+REFUSALS: Final = frozenset(
+    (
+        ReasonCode.UNSPECIFIED_ERROR,
+        ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR,
+        ReasonCode.NOT_AUTHORIZED,
+        ReasonCode.TOPIC_FILTER_INVALID,
+        ReasonCode.TOPIC_NAME_INVALID,
+        ReasonCode.PAYLOAD_FORMAT_INVALID,
+        ReasonCode.RETAIN_NOT_SUPPORTED,
+        ReasonCode.QOS_NOT_SUPPORTED,
+        ReasonCode.WILDCARD_SUBSCRIPTIONS_NOT_SUPPORTED,
+    )
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Ending:
     """How a connection ended. `text` is for people, and contains no secret.
@@ -124,6 +140,12 @@ class Ending:
     is_silent: bool = False
     is_violation: bool = False
     is_close: bool = False
+
+    @property
+    def may_refuse(self) -> bool:
+        """Whether the broker may have ended the connection because of something that it was sent
+        and has not answered, and does not allow."""
+        return self.is_close or (self.by is EndedBy.BROKER and self.code in REFUSALS)
 
     @property
     def refuses_version(self) -> bool:

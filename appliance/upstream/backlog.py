@@ -6,9 +6,8 @@ of them is next, what is dropped when the backlog is full, and what is in memory
 
 - messages that were handed out, at most `IN_FLIGHT_SIZE` bytes;
 - the next ones of each journal, `LOADED_SIZE` for all rules; the others are on disk alone;
-- the latest ones of topics, `LATEST_SIZE`, and with those that are forgotten when the connection
-  ends, `LIVE_SIZE`, each for the link as a whole. A latest one that has no room there is only on
-  disk, by itself, and its topic is in memory, `TOPICS_SIZE`.
+- the latest ones of topics, and those that are forgotten when the connection ends, see
+  `LiveMessages`.
 
 A single message may exceed each of these, as it could not be sent otherwise. Of the rules whose
 messages are refused for now (0x97), each but the first may have twice `IN_FLIGHT_RESERVE` more.
@@ -28,38 +27,36 @@ What is larger than the fleet's broker takes on this connection moves to a queue
 of at most `MOST_HELD` messages and `HELD_SHARE` of the size. They are handed out once on each
 connection that takes more than that on which the least of them was too large.
 
-Each message that was offered is in the end sent, dropped for a reason, or set aside:
-`offered + restored = sent + dropped + set aside + waiting`, see `BacklogCounts`.
+Each message that was offered is in the end sent, dropped for a reason, or set aside, see
+`BacklogCounts`.
 """
 
 from __future__ import annotations
 
 import heapq
-import json
 import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from enum import Enum
 from functools import partial
-from struct import Struct
 from typing import Final
 
-from appliance.broker.backlogs import NO_MESSAGE, Backlogs, RecordsLostError, Segment
+from appliance.broker.backlogs import Backlogs, RecordsLostError, Segment
 from appliance.broker.rate_limited_log import RateLimitedLog
+from appliance.upstream.backlog_counts import BacklogCounts, DropReason, Tally, too_old
+from appliance.upstream.disk_room import DiskRoom
 from appliance.upstream.latest_values import LatestValue
+from appliance.upstream.live_messages import LiveMessages
 from appliance.upstream.rates import TokenBucket
-from appliance.upstream.records import Record, encode_record, record_head, record_times
+from appliance.upstream.records import RecordDecoder, encode_record, record_times
 from appliance.upstream.rule_queue import (
     AGAIN,
     ENTRY_OVERHEAD,
     GONE,
     IN_FLIGHT,
     LATER,
-    LATEST_OVERHEAD,
     LOADED_OVERHEAD,
-    SINGLE_OVERHEAD,
+    READ_AGAIN,
     Entry,
     HeldSegment,
     RuleQueue,
@@ -67,24 +64,21 @@ from appliance.upstream.rule_queue import (
 )
 from appliance.upstream.rules import PRIORITIES, BacklogLimits, OutRule, Priority
 from appliance.upstream.set_aside import AsideRecords, SetAside
+from appliance.upstream.stored_rows import (
+    StoredRows,
+    later_row,
+    numbers_row,
+)
 
 log = logging.getLogger(__name__)
 
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
-#: Bytes of memory: of messages in flight, of records that were read, of those that are in memory
-#: for other reasons. With what a higher lane gets in addition it is 8 MiB a link.
+#: Bytes of memory: of messages in flight, and of records that were read. With those of
+#: `LiveMessages`, and what a higher lane gets in addition, it is 8 MiB a link.
 IN_FLIGHT_SIZE: Final = 3 * MIB
 LOADED_SIZE: Final = 5 * MIB // 4
-LATEST_SIZE: Final = 3 * MIB
-LIVE_SIZE: Final = 7 * MIB // 2
-
-#: Bytes of the topics of which the latest message is only on disk; with more, the oldest are
-#: dropped. And of such messages that are read, of which each rule may have one in any case.
-TOPICS_SIZE: Final = 32 * MIB
-VALUES_SIZE: Final = 256 * KIB
-VALUES_AT_ONCE: Final = 32
 
 #: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
 #: higher lane would wait for all of them. However many wait to be tried again, each rule of which
@@ -93,10 +87,6 @@ IN_FLIGHT_RESERVE: Final = 256 * KIB
 
 #: Bytes of read records that a rule has at least, however many rules there are.
 LOADED_SHARE: Final = 32 * KIB
-
-#: Bytes that may wait to be written for all links, by lane: with more, no message of QoS 0 is
-#: stored. What is acknowledged is bounded by the backlog's size.
-UNWRITTEN_SIZE: Final = (16 * MIB, 12 * MIB, 8 * MIB)
 
 #: After so many messages of other lanes it is a lane's turn. Both lower lanes may have waited, so
 #: that each gets one in 16.
@@ -113,9 +103,6 @@ LONGEST_RETRY: Final = 60.0
 #: Seconds after which a message says when it was published.
 DELAYED: Final = 1.0
 
-#: Seconds until a segment is read again that could not be read.
-READ_AGAIN: Final = 1.0
-
 #: Expired messages that one call of `next` drops: some milliseconds.
 MOST_DROPPED: Final = 1000
 
@@ -125,55 +112,9 @@ _LONGEST_EXPIRY: Final = 0xFFFF_FFFF
 #: The name of the queue of messages that are too large for now; no filter has such a character.
 HELD: Final = "\0too large"
 
-# The first byte of rows in the table of latest records.
-_LATEST: Final = b"L"
-_LATER: Final = b"R"
-_NUMBERS: Final = NO_MESSAGE
-#: The key and the size of a record that is stored by itself, and its head.
-_SINGLE: Final = b"S"
-_SINGLE_HEADER: Final = Struct(">QI")
-
 #: What is too large for now waits in so many messages at most, and this part of the backlog's size.
 MOST_HELD: Final = 10_000
 HELD_SHARE: Final = 1 / 4
-
-
-class DropReason(Enum):
-    """Why a message is not sent."""
-
-    FULL = "full"  # the backlog, or its part of the memory
-    REFUSED = "refused"  # as it is full; the publisher was told
-    STORE = "store"  # nothing can be stored now; the publisher was told
-    DISK = "disk"  # of QoS 0, as more came than the disk takes
-    AGE = "age"
-    EXPIRED = "expired"
-    REPLACED = "replaced"  # by a newer one of its topic
-    OFFLINE = "offline"  # its rule keeps nothing without a connection
-    UNREADABLE = "unreadable"  # damaged on the disk
-
-
-@dataclass(slots=True)
-class BacklogCounts:
-    """What has happened to messages since the start, and what waits now.
-
-    `waiting` includes those `in_flight`, and so do `bytes`. `oldest_at` is when the oldest of them
-    was published, in seconds of the journals' clock. `restored` waited at the start. `dropped` is
-    by rule and reason; of those that were set aside, `aside` are kept. Of those that wait, `held`
-    are larger than the fleet's broker takes now.
-    """
-
-    offered: int = 0
-    restored: int = 0
-    sent: int = 0
-    set_aside: int = 0
-    dropped: Counter[tuple[str, DropReason]] = field(default_factory=Counter)
-    waiting: int = 0
-    in_flight: int = 0
-    bytes: int = 0
-    lanes: tuple[int, int, int] = (0, 0, 0)
-    oldest_at: float | None = None
-    aside: int = 0
-    held: int = 0
 
 
 class Backlog:
@@ -202,6 +143,7 @@ class Backlog:
         self._backlogs = backlogs
         self._latest = backlogs.latest(name)
         self._single = backlogs.single(name)
+        self._disk = DiskRoom(backlogs)
         self._wake = wake
         self._limits = limits
         self._bucket: TokenBucket | None = None
@@ -225,19 +167,16 @@ class Backlog:
         #: The rule that has a record in memory which exceeds its share.
         self._oversized: RuleQueue | None = None
 
-        self._messages = 0
-        self._bytes = 0
+        self._tally = Tally()
+        self._live = LiveMessages(
+            name, self._latest, self._single, limits, self._tally, self._discard, self._wake_up
+        )
+        self._decoder = RecordDecoder()
         #: Handed out and not settled, by number, in this order.
         self._flying: dict[int, Entry] = {}
-        #: Bytes of memory: in flight, to be sent again, and of `latest` and `live`.
+        #: Bytes of memory: in flight, and to be sent again.
         self._flying_size = 0
         self._again_size = 0
-        self._live_size = 0
-        #: Of topics whose latest message is only on disk, and the bytes of those that are read.
-        self._topics_size = 0
-        self._values_size = 0
-        #: No latest message expires before.
-        self._earliest_end = math.inf
         #: To be tried again: when, number, entry; and how many of them are not GONE.
         self._later: list[tuple[float, int, Entry]] = []
         self._later_count = 0
@@ -248,7 +187,6 @@ class Backlog:
         self._repeated: set[int] = set()
         self._full_since: int | None = None
         self._log = RateLimitedLog()
-        self._counts = BacklogCounts()
         #: The bytes of a packet at which all held messages are known to be too large; and at which
         #: those were that have not been handed out on this connection, which takes more.
         self._held_at = 0.0
@@ -278,7 +216,7 @@ class Backlog:
         What waits for a rule that is no more is sent nevertheless.
         """
         self._limits = limits
-        self._earliest_end = 0.0
+        self._live.use(limits)
         self._follow(rules, rate, bytes_per_second, now)
         self._forget_drained()
         self._sort()
@@ -332,7 +270,7 @@ class Backlog:
             self._sort()
 
     def _put_numbers(self) -> None:
-        row = _NUMBERS + json.dumps(self._numbers).encode()
+        row = numbers_row(self._numbers)
         self._numbers_key = self._latest.put(self._numbers_key, row, awaited=False)
 
     def _open_journal(self, queue: RuleQueue) -> None:
@@ -348,88 +286,47 @@ class Backlog:
     # --- what was stored ------------------------------------------------------------------------
 
     def _restore(self) -> None:
-        later: list[tuple[Record, int, int]] = []
-        values: dict[tuple[str, str], LatestValue] = {}
         single = set(self._single.load())
-        for key, row in self._latest.load():
-            try:
-                self._restore_row(key, row, later, values, single)
-            except ValueError as error:
-                log.warning("backlog of %s: a row is unreadable: %s", self._name, error)
-                self._latest.remove(key)
+        rows = StoredRows(self._latest.load(), single)
+        for key, problem in rows.unreadable:
+            log.warning("backlog of %s: a row is unreadable: %s", self._name, problem)
+            self._latest.remove(key)
+        for key in rows.loaded:
+            self._latest.remove(key)
+        self._numbers, self._numbers_key = rows.numbers, rows.numbers_key
         for name in self._numbers:
             queue = self._orphaned(name)
             self._open_journal(queue)
             assert queue.journal is not None
             segments = queue.journal.segments()
             queue.stored = sum(segment.count - segment.done for segment in segments)
-            self._count(queue, queue.stored, sum(map(size_left, segments)))
+            self._tally.add(queue, queue.stored, sum(map(size_left, segments)))
             queue.behind = queue.stored > 0
             if queue.stored:
                 queue.note_restored(self._number)
+        values = rows.values
         for each in single.difference(value.single for value in values.values()):
             self._single.remove(each)
         for (name, topic), value in sorted(values.items(), key=lambda each: each[1].number):
             queue = self._orphaned(name)
             if (value.qos or not queue.mixed) and queue.last_stored(topic):
                 value.after = value.number  # numbers of the journal are below, or of newer messages
-            self._keep_latest(queue, value)
-            self._count(queue, 1, value.size)
-        for record, size, key in sorted(later, key=lambda each: each[0].number):
+            self._live.keep(queue, value)
+            self._tally.add(queue, 1, value.size)
+        for record, size, key in rows.later:
             entry = Entry(self._orphaned(record.rule), record, size)
             entry.key = key
-            self._count(entry.queue, 1, size)
+            self._tally.add(entry.queue, 1, size)
             entry.state = AGAIN
             self._again_size += size + ENTRY_OVERHEAD
             entry.queue.again.append(entry)
             self._repeated.add(record.number)
-        self._counts.restored = self._messages
+        self._tally.restored = self._tally.messages
 
-    def _restore_row(
-        self,
-        key: int,
-        row: bytes,
-        later: list[tuple[Record, int, int]],
-        values: dict[tuple[str, str], LatestValue],
-        single: set[int],
-    ) -> None:
-        """Take over a row; `single` are the keys of records that are stored by themselves.
-
-        Raises ValueError.
-        """
-        kind, data = row[:1], row[1:]
-        if kind == _NUMBERS:
-            self._numbers_key = key
-            self._numbers = _decode_numbers(data)
-            return
-        if kind == _LATER:
-            later.append((Record.decode(data), len(data), key))
-            return
-        if kind == _LATEST:
-            own, size = None, len(data)
-        elif kind == _SINGLE:
-            if len(data) < _SINGLE_HEADER.size:
-                raise ValueError("too short")
-            own, size = _SINGLE_HEADER.unpack_from(data)
-            data = data[_SINGLE_HEADER.size :]
-        else:
-            raise ValueError("of another version")
-        record = Record.decode(data)
-        if own is not None and own not in single:
-            raise ValueError("the record of a row is missing")
-        before = values.get((record.rule, record.topic))
-        if before is not None:  # a rule's rows have one topic each, unless it was damaged
-            raise ValueError("a second row of a topic")
-        expires = math.inf if record.expires_at is None else record.expires_at
-        value = LatestValue(
-            record.topic, record.number, record.qos, size, record.stored_at, expires
-        )
-        value.key = key
-        if own is None:
-            value.data = data
-        else:
-            value.single = own
-        values[record.rule, record.topic] = value
+    def store(self) -> None:
+        """The link ends, and `rewind` was called: store what can be of what is in memory alone."""
+        if not self._backlogs.failing:
+            self._live.store(self._queues.values())
 
     def _orphaned(self, name: str) -> RuleQueue:
         """The queue of a rule that may not be in the configuration any more."""
@@ -453,17 +350,22 @@ class Backlog:
         properties_wire: bytes,
         expires_at: float | None,
         now: float,
+        *,
+        is_acknowledged: bool = True,
+        user: str | None = None,
     ) -> str | None:
         """Accept a message for the topic there; returns None, or why it is refused (0x97).
 
         It may be dropped, now or later, as the limits say. What is stored is part of the store's
-        open batch. `expires_at` is in seconds of the journals' clock.
+        open batch. `expires_at` is in seconds of the journals' clock. With QoS 1 or 2 somebody
+        may be acknowledged for it, who is then asked to wait (`must_wait`) before it is offered.
+        `user` has published it, see `UserShares`.
         """
         queue = self._of_rule.get(id(rule)) or self._queue_of(rule, now)
         kept = queue.kept[2 * qos + retain]
-        self._counts.offered += 1
+        self._tally.offered += 1
         if kept == "none" and not self._online:
-            self._drop(queue, DropReason.OFFLINE)
+            self._tally.drop(queue, DropReason.OFFLINE)
             return None
         self._number = number = self._number + 1
         data = encode_record(
@@ -478,15 +380,17 @@ class Backlog:
             properties_wire,
         )
         size = len(data)
-        is_for_disk = kept == "all" or (
-            kept == "latest" and not self._has_latest_room(queue, topic, size)
-        )
-        if not qos and is_for_disk and self._is_behind_disk(queue, now):
+        if (
+            not (qos and is_acknowledged)
+            and self._disk.must_drop(queue.lane, qos)
+            and self._is_for_disk(queue, topic, kept, size, user)
+        ):
+            self._drop_unwritten(queue, now)
             return None
-        while self._bytes + size > self._limits.size:
+        while self._tally.bytes + size > self._limits.size:
             replaced = queue.latest.get(topic) if kept == "latest" else None
             added = size - replaced.size if replaced is not None else size
-            if self._bytes + added <= self._limits.size:
+            if self._tally.bytes + added <= self._limits.size:
                 break
             if not self._make_room(queue.lane, added, now):
                 return self._refuse(queue)
@@ -496,30 +400,28 @@ class Backlog:
             self._append(queue, topic, data, number, awaited=qos > 0)
         elif kept == "latest":
             persistent = qos > 0 or retain
-            while not (in_memory := self._has_latest_room(queue, topic, size)):
+            while not (in_memory := self._live.has_room(queue, topic, size, user)):
                 before = queue.latest.get(topic)
-                if (before is not None and before.single is not None) or self._has_topic_room(
-                    topic
-                ):
+                is_known = before is not None and before.single is not None
+                if is_known or self._live.has_topic_room(topic):
                     break
                 if self._limits.when_full == "refuse" or not self._drop_oldest_latest(queue.lane):
                     return self._refuse(queue)
             if (persistent or not in_memory) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
             expires = math.inf if expires_at is None else expires_at
-            value = LatestValue(topic, number, qos, size, now, expires)
-            self._offer_latest(queue, value, data, persistent=persistent, in_memory=in_memory)
+            value = LatestValue(topic, number, qos, size, now, expires, user)
+            self._live.offer(queue, value, data, persistent=persistent, in_memory=in_memory)
         else:
             memory = size + LOADED_OVERHEAD
             if not self._make_live_room(queue.lane, memory):
-                self._drop(queue, DropReason.FULL)
+                self._tally.drop(queue, DropReason.FULL)
                 return None
-            self._live_size += memory
-            queue.live.append(data)
+            self._live.put(queue, data)
         queue.messages += 1
         queue.bytes += size
-        self._messages += 1
-        self._bytes += size
+        self._tally.messages += 1
+        self._tally.bytes += size
         if self._idle:
             self._idle = False
             self._wake()
@@ -535,25 +437,54 @@ class Backlog:
 
     def _refuse(self, queue: RuleQueue) -> str | None:
         if self._limits.when_full == "refuse":
-            self._drop(queue, DropReason.REFUSED)
+            self._tally.drop(queue, DropReason.REFUSED)
             self._say_full()
             return f"the backlog of {self._name} is full"
-        self._drop(queue, DropReason.FULL)
+        self._tally.drop(queue, DropReason.FULL)
         self._say_full()
         return None
 
     def _cannot_store(self, queue: RuleQueue, qos: int) -> str | None:
-        self._drop(queue, DropReason.STORE)
+        self._tally.drop(queue, DropReason.STORE)
         return f"the backlog of {self._name} cannot be stored" if qos else None
 
-    def _is_behind_disk(self, queue: RuleQueue, now: float) -> bool:
-        """Drop a message of QoS 0 when more waits to be written than the memory allows."""
-        if self._backlogs.failing or self._backlogs.unwritten < UNWRITTEN_SIZE[queue.lane]:
-            return False
-        self._drop(queue, DropReason.DISK)
-        text = "the backlog of %s: the disk is too slow for %s, messages of QoS 0 are dropped"
+    # --- a disk that is too slow ------------------------------------------------------------------
+
+    @property
+    def is_behind_disk(self) -> bool:
+        """Whether `must_wait` may be true of some message."""
+        return self._disk.is_behind
+
+    def must_wait(
+        self, rule: OutRule, topic: str, qos: int, retain: bool, size: int, user: str | None = None
+    ) -> bool:
+        """Whether the publisher of such a message should wait until more is written, where it is
+        acknowledged: the message would be in memory until then. `size` is about its bytes.
+        """
+        queue = self._queues.get(rule.local_filter)
+        return (
+            queue is not None
+            and self._disk.must_wait(queue.lane)
+            and self._is_for_disk(queue, topic, queue.kept[2 * qos + retain], size, user)
+        )
+
+    def _is_for_disk(
+        self, queue: RuleQueue, topic: str, kept: str, size: int, user: str | None
+    ) -> bool:
+        """Whether a message of this size waits to be written, and is in memory until it is."""
+        if kept == "latest":
+            return not self._live.has_room(queue, topic, size, user)
+        return kept == "all"
+
+    def _drop_unwritten(self, queue: RuleQueue, now: float) -> None:
+        self._tally.drop(queue, DropReason.DISK)
+        text = (
+            "the backlog of %s: the disk is too slow for %s, messages of QoS 0 or from ROS are "
+            "dropped"
+        )
         self._log.warning(now, queue.name, text, self._name, queue.name, burst=1)
-        return True
+
+    # --- the journals -----------------------------------------------------------------------------
 
     def _append(
         self, queue: RuleQueue, topic: str, data: bytes, number: int, *, awaited: bool
@@ -583,169 +514,29 @@ class Backlog:
         """Whether a record of this size may be read now."""
         if queue.loaded + size + LOADED_OVERHEAD <= self._share:
             return True
-        if queue.waiting or self._oversized is not None:
+        if queue.waiting or not self._may_exceed():
             return False
         self._oversized = queue
         return True
 
-    # --- the latest of a topic --------------------------------------------------------------------
+    def _may_exceed(self) -> bool:
+        """Whether a rule may have a record in memory that exceeds its share.
 
-    def _has_latest_room(self, queue: RuleQueue, topic: str, size: int) -> bool:
-        """Whether there is memory for a record of this size as the latest of its topic."""
-        value = queue.latest.get(topic)
-        before = 0 if value is None or value.single is not None else value.size + LATEST_OVERHEAD
-        return self._live_size - before + size + LATEST_OVERHEAD <= LATEST_SIZE
-
-    def _has_topic_room(self, topic: str) -> bool:
-        """Whether there is memory for one more topic whose latest message is only on disk."""
-        return self._topics_size + len(topic) + SINGLE_OVERHEAD <= TOPICS_SIZE
-
-    def _offer_latest(
-        self,
-        queue: RuleQueue,
-        value: LatestValue,
-        data: bytes,
-        *,
-        persistent: bool,
-        in_memory: bool,
-    ) -> None:
-        """Keep it as the latest of its topic, in place of an older one."""
-        key, single = self._replace_latest(queue, value.topic)
-        awaited = value.qos > 0
-        if value.qos or not queue.mixed:  # MQTT does not order QoS 0 and others
-            value.after = queue.last_stored(value.topic)
-        if in_memory:
-            value.data = data
-            if persistent or key is not None:
-                key = self._latest.put(key, _LATEST + data, awaited=awaited)
-        else:
-            value.single = self._single.put(data, awaited=awaited)
-            row = _SINGLE + _SINGLE_HEADER.pack(value.single, value.size) + record_head(data)
-            key = self._latest.put(key, row, awaited=awaited)
-        if single is not None:
-            self._single.remove(single)
-        value.key = key
-        self._keep_latest(queue, value)
-
-    def _replace_latest(self, queue: RuleQueue, topic: str) -> tuple[int | None, int | None]:
-        """A newer message of the topic has come: end the older one; returns the keys of its row and
-        of its record, which is not needed any more once the row is the newer one's."""
-        value = queue.latest.get(topic)
-        if value is not None:
-            self._uncount(queue, value.size)
-            self._free_latest(queue, value)
-            self._drop(queue, DropReason.REPLACED)
-            return value.key, value.single
-        before = queue.newest.get(topic)
-        if before is None:
-            return None, None
-        assert before.value is not None
-        key, single = before.key, before.value.single
-        before.key = before.value.single = None
-        if before.state in (AGAIN, LATER):
-            self._discard(before, DropReason.REPLACED)
-        return key, single
-
-    def _keep_latest(self, queue: RuleQueue, value: LatestValue) -> None:
-        queue.latest.put(value)
-        self._earliest_end = min(self._earliest_end, self._end_of(value))
-        if value.single is None:
-            self._live_size += value.size + LATEST_OVERHEAD
-        else:
-            self._topics_size += len(value.topic) + SINGLE_OVERHEAD
-
-    def _free_latest(self, queue: RuleQueue, value: LatestValue) -> None:
-        """Its memory is not needed for the value any more."""
-        if value.single is None:
-            self._live_size -= value.size + LATEST_OVERHEAD
-            return
-        self._topics_size -= len(value.topic) + SINGLE_OVERHEAD
-        if value.is_read:
-            value.is_read = False
-            queue.values_read -= 1
-            self._values_size -= value.size
-
-    def _drop_latest(self, queue: RuleQueue, value: LatestValue, reason: DropReason) -> None:
-        queue.latest.pop(value)
-        self._free_latest(queue, value)
-        self._uncount(queue, value.size)
-        self._remove_rows(value.key, value.single)
-        self._drop(queue, reason)
-
-    def _remove_rows(self, key: int | None, single: int | None) -> None:
-        if key is not None:
-            self._latest.remove(key)
-        if single is not None:
-            self._single.remove(single)
-
-    def _drop_oldest_latest(self, lane: int) -> bool:
-        """Drop the oldest latest message of the lowest lane that is not above; False if none."""
-        self._say_full()
-        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            firsts = [
-                (value.number, queue, value)
-                for queue in self._lanes[lowest]
-                if (value := queue.latest.oldest()) is not None
-            ]
-            if firsts:
-                _, queue, value = min(firsts, key=lambda each: each[0])
-                self._drop_latest(queue, value, DropReason.FULL)
-                return True
-        return False
-
-    # --- reading the latest -----------------------------------------------------------------------
-
-    def _read_values(self, queue: RuleQueue, now: float) -> None:
-        """Read the next values that are only on disk, if there is memory for them."""
-        for place, value in enumerate(queue.latest.ready.values()):
-            if place == VALUES_AT_ONCE or not self._read_value(queue, value, now):
-                break
-
-    def _read_value(self, queue: RuleQueue, value: LatestValue, now: float) -> bool:
-        """Read one, if it is not in memory; False if it cannot be read now.
-
-        Each rule may have one, and the link `VALUES_SIZE` bytes.
+        One has: the others wait until that is sent, unless its rule is itself made to wait.
         """
-        if value.single is None or value.is_read:
-            return True
-        if queue.values_failed:
-            queue.values_failed = False
-            queue.values_at = now + READ_AGAIN
-        if queue.values_at > now:
-            return False
-        if queue.values_read and self._values_size + value.size > VALUES_SIZE:
-            return False
-        value.is_read = True
-        queue.values_read += 1
-        self._values_size += value.size
-        self._single.read(value.single, partial(self._value_was_read, queue, value))
-        return True
-
-    def _value_was_read(
-        self, queue: RuleQueue, value: LatestValue, outcome: list[bytes] | Exception
-    ) -> None:
-        if queue.latest.get(value.topic) is not value:
-            return  # it was dropped meanwhile
-        if isinstance(outcome, list) and len(outcome) == 1 and len(outcome[0]) == value.size:
-            queue.values_at = 0.0
-            value.data = outcome[0]
-        elif isinstance(outcome, list | RecordsLostError):
-            self._drop_latest(queue, value, DropReason.UNREADABLE)
-        else:
-            if not queue.values_at:
-                log.warning("backlog of %s: cannot be read: %s", self._name, outcome)
-            queue.values_failed = True
-            value.is_read = False
-            queue.values_read -= 1
-            self._values_size -= value.size
-        if self._idle:
-            self._idle = False
-            self._wake()
+        owner = self._oversized
+        return (
+            owner is None
+            or not owner.passes
+            or owner.later >= MOST_LATER
+            or owner.bucket is not None
+        )
 
     # --- full -------------------------------------------------------------------------------------
 
     def _make_room(self, lane: int, size: int, now: float) -> bool:
-        """Drop until a message of the lane has room: too old ones, then the lowest lane's oldest.
+        """Drop until a message of the lane has room: too old ones, then the lowest lane's oldest,
+        in it the latest ones of who has more than a share of these first.
 
         Whatever is more urgent than the message stays.
         """
@@ -754,15 +545,18 @@ class Backlog:
             return False
         for queue in self._queues.values():
             self._drop_outdated(queue, now)
-        if self._bytes <= limit:
+        if self._tally.bytes <= limit:
             return True
         if self._limits.when_full == "refuse":
             return False
         self._say_full()
         for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            while self._bytes > limit and self._drop_oldest(lowest):
+            queues = self._lanes[lowest]
+            while self._tally.bytes > limit and (
+                self._live.drop_of_largest(queues) or self._drop_oldest(lowest)
+            ):
                 pass
-        return self._bytes <= limit
+        return self._tally.bytes <= limit
 
     def _drop_oldest(self, lane: int) -> bool:
         """Drop the oldest message of a lane, or the oldest segment on disk; False without any."""
@@ -784,6 +578,24 @@ class Backlog:
             self._drop_first_stored(found, DropReason.FULL)
         return True
 
+    def _drop_oldest_latest(self, lane: int) -> bool:
+        """Drop the oldest latest message of the lowest lane that is not above, first of who has
+        more than a share; False if none."""
+        self._say_full()
+        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
+            if self._live.drop_of_largest(self._lanes[lowest], topics=True):
+                return True
+            firsts = [
+                (value.number, queue, value)
+                for queue in self._lanes[lowest]
+                if (value := queue.latest.oldest()) is not None
+            ]
+            if firsts:
+                _, queue, value = min(firsts, key=lambda each: each[0])
+                self._live.drop(queue, value, DropReason.FULL)
+                return True
+        return False
+
     def _drop_first_stored(self, queue: RuleQueue, reason: DropReason) -> None:
         """Drop what is the first of `again`, of `waiting` or of what is not read."""
         queue.skip_gone()
@@ -791,8 +603,8 @@ class Backlog:
             self._discard(queue.again.popleft(), reason)
         elif queue.waiting:
             data, part, index = self._pop_waiting(queue)
-            self._uncount(queue, len(data))
-            self._drop(queue, reason)
+            self._tally.remove(queue, len(data))
+            self._tally.drop(queue, reason)
             queue.settle(part, index)
             self._check_emptied(queue)
         else:
@@ -800,44 +612,42 @@ class Backlog:
 
     def _drop_unread(self, queue: RuleQueue, segment: Segment | None, reason: DropReason) -> None:
         count, size = queue.drop_unread(segment)
-        self._count(queue, -count, -size)
-        self._drop(queue, reason, count)
+        self._tally.add(queue, -count, -size)
+        self._tally.drop(queue, reason, count)
         self._check_emptied(queue)
 
     def _drop_first_live(self, queue: RuleQueue, reason: DropReason) -> None:
         value = queue.latest.oldest()
         if value is not None:
-            self._drop_latest(queue, value, reason)
+            self._live.drop(queue, value, reason)
             return
-        data = queue.live.popleft()
-        self._live_size -= len(data) + LOADED_OVERHEAD
-        self._uncount(queue, len(data))
-        self._drop(queue, reason)
+        data = self._live.pop(queue)
+        self._tally.remove(queue, len(data))
+        self._tally.drop(queue, reason)
 
     def _make_live_room(self, lane: int, memory: int) -> bool:
         """Drop what is forgotten with the connection until so many bytes have room.
 
         As for `_make_room`.
         """
-        if self._live_size + memory <= LIVE_SIZE:
+        if self._live.fits(memory):
             return True
         self._say_full()
         for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            while self._live_size + memory > LIVE_SIZE:
+            while not self._live.fits(memory):
                 waiting = [queue for queue in self._lanes[lowest] if queue.live]
                 if not waiting:
                     break
                 oldest = min(waiting, key=lambda queue: record_times(queue.live[0])[0])
-                data = oldest.live.popleft()
-                self._live_size -= len(data) + LOADED_OVERHEAD
-                self._uncount(oldest, len(data))
-                self._drop(oldest, DropReason.FULL)
-        return not self._live_size or self._live_size + memory <= LIVE_SIZE
+                data = self._live.pop(oldest)
+                self._tally.remove(oldest, len(data))
+                self._tally.drop(oldest, DropReason.FULL)
+        return not self._live.memory or self._live.fits(memory)
 
     def _say_full(self) -> None:
         """Log that messages are dropped, once until what waits is half as much."""
         if self._full_since is None:
-            self._full_since = self._dropped_as_full()
+            self._full_since = self._tally.dropped_as_full()
             what = (
                 "messages are refused"
                 if self._limits.when_full == "refuse"
@@ -846,25 +656,20 @@ class Backlog:
             log.warning(
                 "the backlog of %s is full (%d messages, %d bytes): %s",
                 self._name,
-                self._messages,
-                self._bytes,
+                self._tally.messages,
+                self._tally.bytes,
                 what,
             )
-
-    def _dropped_as_full(self) -> int:
-        dropped = self._counts.dropped.items()
-        full = (DropReason.FULL, DropReason.REFUSED)
-        return sum(count for (_, reason), count in dropped if reason in full)
 
     def tick(self, now: float) -> None:
         """Drop what has become too old; to be called every second or so."""
         self._log.tick(now)
         for queue in self._queues.values():
             self._drop_outdated(queue, now)
-        self._drop_outdated_latest(now)
+        self._live.drop_outdated(self._queues.values(), now)
         self._forget_drained()
-        if self._full_since is not None and 2 * self._bytes < self._limits.size:
-            count = self._dropped_as_full() - self._full_since
+        if self._full_since is not None and 2 * self._tally.bytes < self._limits.size:
+            count = self._tally.dropped_as_full() - self._full_since
             self._full_since = None
             log.warning(
                 "the backlog of %s has room again; %d messages were dropped or refused",
@@ -872,31 +677,13 @@ class Backlog:
                 count,
             )
 
-    def _drop_outdated_latest(self, now: float) -> None:
-        """Drop the latest messages that are too old or expired; most often there can be none."""
-        if self._earliest_end > now:
-            return
-        self._earliest_end = math.inf
-        for queue in self._queues.values():
-            for value in list(queue.latest):
-                reason = self._too_old(value.stored_at, value.expires_at, now)
-                if reason is not None:
-                    self._drop_latest(queue, value, reason)
-                else:
-                    self._earliest_end = min(self._earliest_end, self._end_of(value))
-
-    def _end_of(self, value: LatestValue) -> float:
-        """When it will be too old."""
-        age = self._limits.age
-        return value.expires_at if age is None else min(value.expires_at, value.stored_at + age)
-
     def _drop_outdated(self, queue: RuleQueue, now: float) -> None:
         """Drop what is too old or expired, from the front of the queue."""
         while True:
             queue.skip_gone()
             if queue.again:
                 record = queue.again[0].record
-                reason = self._too_old(record.stored_at, record.expires_at, now)
+                reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
             elif queue.waiting:
                 reason = self._why(queue.waiting[0], now)
             else:
@@ -909,21 +696,14 @@ class Backlog:
                 break
             self._drop_first_stored(queue, reason)
         while queue.live and (reason := self._why(queue.live[0], now)):
-            data = queue.live.popleft()
-            self._live_size -= len(data) + LOADED_OVERHEAD
-            self._uncount(queue, len(data))
-            self._drop(queue, reason)
+            data = self._live.pop(queue)
+            self._tally.remove(queue, len(data))
+            self._tally.drop(queue, reason)
 
     def _why(self, data: bytes, now: float) -> DropReason | None:
         """Why an encoded record is not to be sent any more, if so."""
         _, stored_at, expires_at = record_times(data)
-        return self._too_old(stored_at, expires_at, now)
-
-    def _too_old(self, stored_at: float, expires_at: float | None, now: float) -> DropReason | None:
-        if expires_at is not None and expires_at <= now:
-            return DropReason.EXPIRED
-        age = self._limits.age
-        return DropReason.AGE if age is not None and stored_at + age <= now else None
+        return too_old(stored_at, expires_at, self._limits.age, now)
 
     # --- out --------------------------------------------------------------------------------------
 
@@ -951,7 +731,7 @@ class Backlog:
         It is in flight until it is settled, set aside, tried again or rewound; what is sent with
         QoS 0 is to be settled at once.
         """
-        if self._messages == len(self._flying):
+        if self._tally.messages == len(self._flying):
             self._idle = True  # also while a rate is exceeded: the next message wakes the sender
             return None
         only_again = False
@@ -972,12 +752,10 @@ class Backlog:
             entry = self._next_later(now)
             if entry is not None:
                 return entry
-        passed = self._passed
-        turn = 2 if passed[2] >= TURN else 1 if passed[1] >= TURN else 0
         entry = None
-        if turn:
-            passed[turn] = 0
-            entry = self._next_of(turn, now, only_again, most_later)
+        for turn in (2, 1):
+            if entry is None and self._passed[turn] >= TURN:
+                entry = self._next_of(turn, now, only_again, most_later)
         if entry is None:
             entry = (
                 self._next_of(0, now, only_again, most_later)
@@ -987,10 +765,13 @@ class Backlog:
         if entry is None:
             self._idle = True
             return None
-        lane = entry.queue.lane
-        passed[1] = passed[1] + 1 if lane != 1 else 0
-        passed[2] = passed[2] + 1 if lane != 2 else 0
+        self._note_passed(entry.queue.lane, 1)
         return entry
+
+    def _note_passed(self, lane: int, count: int) -> None:
+        """So many messages of the lane were handed out."""
+        for other in (1, 2):
+            self._passed[other] = min(TURN, self._passed[other] + count) if other != lane else 0
 
     def take(self, now: float, most: int, size: int) -> list[Entry]:
         """The next messages, at most so many, as that many calls of `next` would hand them out.
@@ -1005,13 +786,15 @@ class Backlog:
         if queue is None or most < 2:
             entry = self.next(now)
             return [] if entry is None else [entry]
-        lane, waiting, flying = queue.lane, queue.waiting, self._flying
+        lane, waiting, flying, decoder = queue.lane, queue.waiting, self._flying, self._decoder
         entries: list[Entry] = []
-        pop, decode, age = queue.pop_waiting, Record.decode, self._limits.age
-        memory = self._flying_size + self._again_size
-        while len(entries) < most and size > 0 and memory < IN_FLIGHT_SIZE and waiting:
+        age = self._limits.age
+        before = self._flying_size
+        room = IN_FLIGHT_SIZE - before - self._again_size
+        taken = 0  # bytes of memory
+        while len(entries) < most and size > 0 and taken < room and waiting:
             try:
-                record = decode(waiting[0])
+                record = decoder.decode(waiting[0])
             except ValueError:
                 break  # it is for `next` to tell
             stored_at, expires_at = record.stored_at, record.expires_at
@@ -1019,7 +802,7 @@ class Backlog:
                 break  # to drop it, too
             if age is not None and stored_at + age <= now:
                 break
-            data, part, index = pop()
+            data, part, index = queue.pop_waiting()
             length = len(data)
             entry = Entry(queue, record, length)
             entry.part = part
@@ -1030,18 +813,17 @@ class Backlog:
             if expires_at is not None:
                 entry.expiry = min(_LONGEST_EXPIRY, math.ceil(expires_at - now))
             flying[record.number] = entry
-            memory += length + ENTRY_OVERHEAD
-            self._flying_size += length + ENTRY_OVERHEAD
+            taken += length + ENTRY_OVERHEAD
             size -= length
             entries.append(entry)
+        self._flying_size = before + taken
         if not entries:
             entry_of_next = self.next(now)
             return [] if entry_of_next is None else [entry_of_next]
         if self._oversized is queue:
             self._oversized = None
         self._live_first[lane] = True
-        for other in (1, 2):
-            self._passed[other] = self._passed[other] + len(entries) if other != lane else 0
+        self._note_passed(lane, len(entries))
         return entries
 
     def _only_queue(self, most: int) -> tuple[RuleQueue | None, int]:
@@ -1054,7 +836,7 @@ class Backlog:
         ):
             return None, 0
         found: RuleQueue | None = None
-        for queues in self._lanes:
+        for lane, queues in enumerate(self._lanes):
             for queue in queues:
                 if not queue.passes:
                     continue  # of what waits here nothing may be sent
@@ -1069,8 +851,10 @@ class Backlog:
                 ):
                     if found is None:
                         found = queue
-                    elif found.lane == queue.lane:
+                    elif found.lane == lane:
                         return None, 0  # whichever has the older message
+                    else:
+                        most = min(most, TURN - self._passed[lane])
         if (
             found is None
             or found.again
@@ -1081,9 +865,6 @@ class Backlog:
             or (found.behind and found.reading is None and 2 * found.loaded <= self._share)
         ):
             return None, 0
-        for lane in (1, 2):
-            if lane != found.lane:
-                most = min(most, TURN - self._passed[lane])
         return found, most
 
     def put_back(self, entries: Iterable[Entry]) -> None:
@@ -1119,9 +900,9 @@ class Backlog:
                 if latest.blocked:
                     latest.unblock(queue.first_number_stored())
                 if latest.ready and next(iter(latest.ready.values())).data is None:
-                    self._read_values(queue, now)
+                    self._live.read_next(queue, now)
                 if queue.held_up_by is not None and queue.is_held_up():
-                    self._read_value(queue, queue.held_up_by, now)
+                    self._live.read(queue, queue.held_up_by, now)
                     is_held_up = not again
                 else:
                     is_held_up = False
@@ -1156,7 +937,7 @@ class Backlog:
         if queue.again:
             entry = queue.again.popleft()
             record = entry.record
-            reason = self._too_old(record.stored_at, record.expires_at, now)
+            reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
             if reason is not None:
                 self._discard(entry, reason)
                 return None
@@ -1166,25 +947,25 @@ class Backlog:
             if value.data is not None:
                 return self._take_latest(queue, value, now)
             queue.held_up_by = value
-            self._read_value(queue, value, now)
+            self._live.read(queue, value, now)
             return None
         data, part, index = self._pop_waiting(queue)
         try:
-            record = Record.decode(data)
-            reason = self._too_old(record.stored_at, record.expires_at, now)
+            record = self._decoder.decode(data)
+            reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
         except ValueError as error:
             log.warning("backlog of %s: a message is unreadable: %s", self._name, error)
             reason = DropReason.UNREADABLE
         if reason is not None:
-            self._uncount(queue, len(data))
-            self._drop(queue, reason)
+            self._tally.remove(queue, len(data))
+            self._tally.drop(queue, reason)
             queue.settle(part, index)
             self._check_emptied(queue)
             return None
         if record.number in self._repeated:
             self._repeated.remove(record.number)
-            self._counts.restored -= 1
-            self._uncount(queue, len(data))
+            self._tally.restored -= 1
+            self._tally.remove(queue, len(data))
             queue.settle(part, index)
             self._check_emptied(queue)
             return None
@@ -1200,14 +981,13 @@ class Backlog:
             if value.data is not None:
                 return self._take_latest(queue, value, now)
             break
-        data = queue.live.popleft()
-        self._live_size -= len(data) + LOADED_OVERHEAD
+        data = self._live.pop(queue)
         reason = self._why(data, now)
         if reason is not None:
-            self._uncount(queue, len(data))
-            self._drop(queue, reason)
+            self._tally.remove(queue, len(data))
+            self._tally.drop(queue, reason)
             return None
-        entry = Entry(queue, Record.decode(data), len(data))
+        entry = Entry(queue, self._decoder.decode(data), len(data))
         entry.qos = min(queue.qos, entry.record.qos)
         return self._hand_out(entry, now)
 
@@ -1215,18 +995,17 @@ class Backlog:
         """Hand out a value that is in memory; None when it was too old, or is unreadable."""
         data = value.data
         assert data is not None
-        reason = self._too_old(value.stored_at, value.expires_at, now)
+        reason = too_old(value.stored_at, value.expires_at, self._limits.age, now)
         if reason is None:
             try:
-                record = Record.decode(data)
+                record = self._decoder.decode(data)
             except ValueError as error:
                 log.warning("backlog of %s: a message is unreadable: %s", self._name, error)
                 reason = DropReason.UNREADABLE
         if reason is not None:
-            self._drop_latest(queue, value, reason)
+            self._live.drop(queue, value, reason)
             return None
-        queue.latest.pop(value)
-        self._free_latest(queue, value)
+        self._live.take(queue, value)
         entry = Entry(queue, record, value.size)
         entry.key = value.key
         entry.value = value
@@ -1265,7 +1044,7 @@ class Backlog:
                 continue
             self._count_later(entry, -1)
             record = entry.record
-            reason = self._too_old(record.stored_at, record.expires_at, now)
+            reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
             if reason is None:
                 self._again_size -= entry.size + ENTRY_OVERHEAD
                 return self._hand_out(entry, now)
@@ -1280,7 +1059,7 @@ class Backlog:
         ]
         blocked = max(times, default=now)
         if blocked > now:
-            return blocked if self._messages > len(self._flying) else None
+            return blocked if self._tally.messages > len(self._flying) else None
         while self._later and self._later[0][2].state != LATER:
             heapq.heappop(self._later)
         times = [due for due, _, _ in self._later[:1]]
@@ -1299,11 +1078,13 @@ class Backlog:
             queue.read_at = now + READ_AGAIN
         if queue.read_at > now:
             return
+        if queue.has_large_next and (queue.waiting or not self._may_exceed()):
+            return
         segment = queue.unread()
         if segment is None:
             queue.behind = False
             return
-        if segment.size > self._share and segment.count == 1 and self._oversized is not None:
+        if segment.size > self._share and segment.count == 1 and not self._may_exceed():
             return
         queue.start_reading(segment)
         assert queue.journal is not None
@@ -1324,6 +1105,10 @@ class Backlog:
         else:
             queue.read_at = 0.0
             self._keep_read(queue, segment, outcome, arrived)
+        self._wake_up()
+
+    def _wake_up(self) -> None:
+        """`next` may have something again."""
         if self._idle:
             self._idle = False
             self._wake()
@@ -1337,11 +1122,13 @@ class Backlog:
     ) -> None:
         """Keep of a segment what the memory allows, and what was appended while it was read."""
         first, underestimated = queue.begin(segment, records)
-        self._count(queue, 0, underestimated)
-        for data in records[first:]:
-            if not self._has_memory(queue, len(data)):
-                return
-            queue.keep(segment, data)
+        self._tally.add(queue, 0, underestimated)
+        if not queue.keep_rest(segment, records, first, self._share):
+            for kept, data in enumerate(records[first:]):
+                if not self._has_memory(queue, len(data)):
+                    queue.has_large_next = not kept
+                    return
+                queue.keep(segment, data)
         for place, index, data in arrived:
             if place is segment and index < len(records):
                 continue
@@ -1362,7 +1149,7 @@ class Backlog:
         """It is acknowledged (below 0x80), or was sent with QoS 0; ignored if not in flight."""
         if entry.state != IN_FLIGHT:
             return
-        self._counts.sent += 1
+        self._tally.sent += 1
         self._land(entry)
         self._end(entry)
 
@@ -1401,9 +1188,9 @@ class Backlog:
 
     def _settled(self, queue: RuleQueue, part: HeldSegment, count: int, size: int) -> None:
         """So many records of a segment, of `size` bytes in all, were in flight, and are settled."""
-        self._counts.sent += count
+        self._tally.sent += count
         self._flying_size -= size + count * ENTRY_OVERHEAD
-        self._count(queue, -count, -size)
+        self._tally.add(queue, -count, -size)
         queue.settled(part, count)
         self._check_emptied(queue)
 
@@ -1412,8 +1199,10 @@ class Backlog:
 
         Others overtake it. It is stored by itself, so that they need not be repeated after a kill.
         """
-        if entry.state != IN_FLIGHT:
-            return
+        if entry.state == IN_FLIGHT:
+            self._postpone(entry, now)
+
+    def _postpone(self, entry: Entry, now: float) -> None:
         self._land(entry)
         queue = entry.queue
         self._again_size += entry.size + ENTRY_OVERHEAD
@@ -1421,8 +1210,8 @@ class Backlog:
             entry.state = AGAIN
             self._discard(entry, DropReason.REPLACED)
             return
-        if entry.part is not None and queue.later < MOST_LATER:
-            entry.key = self._latest.put(None, _LATER + entry.record.encode(), awaited=False)
+        if entry.part is not None and queue.later < MOST_LATER and self._disk.may_store_again:
+            entry.key = self._latest.put(None, later_row(entry.record.encode()), awaited=False)
             queue.settle(entry.part, entry.index)
             entry.part = None
             self._check_emptied(queue)
@@ -1437,12 +1226,13 @@ class Backlog:
         self._later_size += count * (entry.size + ENTRY_OVERHEAD)
         entry.queue.later += count
 
-    def hold(self, entry: Entry, packet_size: int) -> bool:
+    def hold(self, entry: Entry, packet_size: int, now: float) -> bool:
         """The fleet's broker takes only smaller packets now: keep it until one takes more than
         `packet_size` bytes, and send what follows.
 
         False for what only counts as long as nothing newer has come, or is not stored, and where
-        too much is kept so.
+        too much is kept so. While it cannot be stored in another place it stays where it is, and is
+        tried again after a while.
         """
         if entry.topic is not None or (entry.part is None and entry.key is None):
             return False
@@ -1451,6 +1241,9 @@ class Backlog:
             held.messages >= MOST_HELD or held.bytes + entry.size > self._limits.size * HELD_SHARE
         ):
             return False
+        if not self._disk.may_store_again:
+            self._postpone(entry, now)
+            return True
         if not held.messages:
             held.passes = 0
             self._held_at = packet_size
@@ -1459,7 +1252,7 @@ class Backlog:
         record = entry.record
         data = record.encode()
         self._append(held, record.topic, data, record.number, awaited=False)
-        self._count(held, 1, len(data))
+        self._tally.add(held, 1, len(data))
         self._land(entry)
         self._end(entry)
         return True
@@ -1468,7 +1261,7 @@ class Backlog:
         """The fleet's broker will never take it: keep it for the user, and send what follows."""
         if entry.state != IN_FLIGHT:
             return
-        self._counts.set_aside += 1
+        self._tally.set_aside += 1
         is_latest = entry.value is not None
         self._land(entry)
         self._aside.add(entry.record, reason, now, is_latest=is_latest)
@@ -1494,10 +1287,9 @@ class Backlog:
                 self._discard(entry, DropReason.OFFLINE)
         for queue in self._queues.values():
             while queue.live:
-                data = queue.live.popleft()
-                self._live_size -= len(data) + LOADED_OVERHEAD
-                self._uncount(queue, len(data))
-                self._drop(queue, DropReason.OFFLINE)
+                data = self._live.pop(queue)
+                self._tally.remove(queue, len(data))
+                self._tally.drop(queue, DropReason.OFFLINE)
 
     def _put_back(self, entry: Entry) -> None:
         """It is not in flight any more, and is sent again before all others of its rule."""
@@ -1527,14 +1319,14 @@ class Backlog:
         size = entry.size
         queue.messages -= 1
         queue.bytes -= size
-        self._messages -= 1
-        self._bytes -= size
+        self._tally.messages -= 1
+        self._tally.bytes -= size
         part = entry.part
         if part is not None:
             queue.settle(part, entry.index)
             self._check_emptied(queue)
         if entry.key is not None:
-            self._remove_rows(entry.key, None if entry.value is None else entry.value.single)
+            self._live.remove_rows(entry.key, None if entry.value is None else entry.value.single)
             entry.key = None
         if entry.topic is not None and queue.newest.get(entry.topic) is entry:
             del queue.newest[entry.topic]
@@ -1544,31 +1336,18 @@ class Backlog:
         if entry.state == LATER:
             self._count_later(entry, -1)
         self._again_size -= entry.size + ENTRY_OVERHEAD
-        self._drop(entry.queue, reason)
+        self._tally.drop(entry.queue, reason)
         self._end(entry)
 
     def _check_emptied(self, queue: RuleQueue) -> None:
         if not queue.stored:
             queue.empty(self._number)
 
-    def _drop(self, queue: RuleQueue, reason: DropReason, count: int = 1) -> None:
-        if count:
-            self._counts.dropped[queue.name, reason] += count
-
-    def _count(self, queue: RuleQueue, messages: int, size: int) -> None:
-        queue.messages += messages
-        queue.bytes += size
-        self._messages += messages
-        self._bytes += size
-
-    def _uncount(self, queue: RuleQueue, size: int) -> None:
-        self._count(queue, -1, -size)
-
     # --- status -----------------------------------------------------------------------------------
 
     def counts(self) -> BacklogCounts:
         """What waits now, and what has happened since the start; a copy."""
-        counts = self._counts
+        counts = self._tally
         oldest: list[float] = [entry.record.stored_at for entry in self._flying.values()]
         oldest += [entry.record.stored_at for _, _, entry in self._later if entry.state == LATER]
         for queue in self._queues.values():
@@ -1582,9 +1361,9 @@ class Backlog:
             counts.sent,
             counts.set_aside,
             Counter(counts.dropped),
-            self._messages,
+            self._tally.messages,
             len(self._flying),
-            self._bytes,
+            self._tally.bytes,
             (lanes[0], lanes[1], lanes[2]),
             min(oldest, default=None),
             len(self._aside),
@@ -1606,11 +1385,3 @@ def _bucket(bucket: TokenBucket | None, rate: float | None, now: float) -> Token
     if rate is None or (bucket is not None and bucket.rate == rate):
         return None if rate is None else bucket
     return TokenBucket(rate, now)
-
-
-def _decode_numbers(data: bytes) -> dict[str, int]:
-    """The numbers of the rules' journals. Raises ValueError."""
-    numbers = json.loads(data)
-    if not isinstance(numbers, dict) or not all(isinstance(each, int) for each in numbers.values()):
-        raise ValueError("the table of rules is damaged")
-    return numbers

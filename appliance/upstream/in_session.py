@@ -191,6 +191,7 @@ class InSession:
         self._is_detached = True
         self._acknowledgements.close()
         self._allowance.stop_waiting(self)
+        self._broker.disk.forget(self)
         self._waiting.clear()
         self._count(-self._waiting_bytes)
         self._broker.detach(self._session)
@@ -403,7 +404,7 @@ class InSession:
         if route.undecided and self._waits_for_decisions(route):
             return False
         self._undecided_since = None
-        if route.allowed and packet.qos and self._waits_for_receivers(route, message):
+        if route.allowed and packet.qos and self._waits_for_receivers(route, message, origin):
             return False
         checks = broker.features.check_payload_format
         if checks and route.allowed and not is_text(packet.payload, packet.properties):
@@ -459,14 +460,18 @@ class InSession:
             self._connection.later(LOOK_INTERVAL)
         return waits
 
-    def _waits_for_receivers(self, route: Fanout, message: Message) -> bool:
-        """Whether receivers have no room now, but soon will: see `broker.backpressure`."""
+    def _waits_for_receivers(self, route: Fanout, message: Message, origin: Session) -> bool:
+        """Whether receivers have no room now, but soon will, or the disk is behind: see
+        `broker.backpressure`."""
         broker, allowance = self._broker, self._allowance
         congestions = broker.congestions(route, message) if broker.accounting.congested else []
-        if not congestions or allowance.used_up:
-            allowance.end_wait(self)
+        if congestions and not allowance.used_up:
+            self._connection.later(max(allowance.wait(self, congestions, broker.now), RECHECK))
+            return True
+        allowance.end_wait(self)
+        if not broker.must_wait_for_disk(route, message, origin):
             return False
-        self._connection.later(max(allowance.wait(self, congestions, broker.now), RECHECK))
+        self._connection.later(broker.disk.wait(self))
         return True
 
     # --- acknowledgements ----------------------------------------------------------------------
@@ -507,6 +512,8 @@ class InSession:
 
 class _InLink(InsideLink):
     """The link of the session: who asks how its client is, asks about the fleet's broker."""
+
+    acknowledges = True
 
     def __init__(self, connection: InConnection) -> None:
         self._connection = connection

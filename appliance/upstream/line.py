@@ -28,7 +28,6 @@ from appliance.upstream.credentials import Credentials, read_credentials
 from appliance.upstream.dial import dial, in_thread
 from appliance.upstream.dial_error import DialError
 from appliance.upstream.limits import KINDS, dialled_tls
-from appliance.upstream.presence import Presence
 from appliance.upstream.refusals import (
     ending_advice,
     subscription_advice,
@@ -88,8 +87,8 @@ class LineOwner(ChannelOwner, Protocol):
     def surroundings(self) -> Surroundings:
         """For the transport."""
 
-    def publish_state(self, channel: Channel, presence: Presence) -> None:
-        """Say on the channel whether the robot is online."""
+    def say_offline(self, channel: Channel) -> None:
+        """Say on the channel that the robot is offline from now on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +126,8 @@ class Line:
         self._restart: asyncio.TimerHandle | None = None
         self._is_stopping = False
         self._is_causeless = False
+        #: What the link knows of how the last connection ended.
+        self._advice = ""
         #: The first server, dialled while the present connection is with another one.
         self._next: _Dialled | None = None
         #: Set when the next dial is due before its time.
@@ -136,6 +137,11 @@ class Line:
         return (
             f"{self._link}, for the rules with offline: keep" if self.is_kept else str(self._link)
         )
+
+    @property
+    def position(self) -> int:
+        """The position in `servers` of the one that is connected or dialled."""
+        return self._backoff.server
 
     @property
     def _client_id(self) -> str:
@@ -174,7 +180,7 @@ class Line:
 
     def _say_offline(self, channel: Channel) -> None:
         if channel.connection.granted is not None and not self.is_kept:
-            self._link.publish_state(channel, Presence.OFFLINE)
+            self._link.say_offline(channel)
 
     async def _run(self) -> None:
         interval = KINDS[self._settings.kind].connect_interval
@@ -335,11 +341,12 @@ class Line:
         self.problem = None
         log.info("%s: connected to %s as %s", self, self.server, quote(channel.client_id))
 
-    def on_ended(self, ending: Ending, *, is_causeless: bool) -> None:
+    def on_ended(self, ending: Ending, *, is_causeless: bool, advice: str) -> None:
         """The connection has ended; without a cause, if the broker has closed it though nothing
-        that it was sent can have been the reason."""
+        that it was sent can have been the reason. The link may have an advice."""
         self.channel = None
         self._is_causeless = is_causeless
+        self._advice = advice
         if self._ending is not None and not self._ending.done():
             self._ending.set_result(ending)
 
@@ -367,10 +374,10 @@ class Line:
         elif self._is_causeless:
             wait = self._backoff.closed(now)
         else:
-            advice = ending_advice(
+            advice = self._advice or ending_advice(
                 ending, self._settings, self._settings.servers[server], self._client_id
             )
-            if ending.is_close and channel.unanswered:
+            if ending.may_refuse and channel.unanswered:
                 advice = unanswered_filters(channel.unanswered)
                 self._leave_out(channel)
             return self._failed(f"{ending.text}; {advice}" if advice else ending.text)

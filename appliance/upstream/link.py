@@ -397,6 +397,15 @@ class FleetConnection(Generic[T]):
         tokens: list[T] = []
         last = -1  # the acknowledgement that `tokens` belongs to
         try:
+            packet_ids, data = self._protocol.take_pubacks(data)
+            if packet_ids:
+                last = 0
+                events.append(Acknowledged(tokens, last))
+                for packet_id in packet_ids:
+                    entry = inflight.pop(packet_id, None)
+                    if entry is None:
+                        raise _unknown("PUBACK", packet_id)
+                    tokens.append(entry[0])
             for event in self._protocol.receive_data(data):
                 if isinstance(event, int):
                     if event & _TYPE == PUBACK:

@@ -16,8 +16,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
-from appliance.broker.link import ReceivingLink
+from appliance.broker.link import InsideLink, ReceivingLink
 from appliance.broker.message import Message
 from appliance.broker.session import Session, publisher_of
 from appliance.broker.values import Action, Identity, PublishRejection
@@ -45,6 +46,16 @@ _RESPONSE_TOPIC = bytes((Property.RESPONSE_TOPIC,))
 class Offers(Protocol):
     """Takes what is to be sent: the link's backlog."""
 
+    @property
+    def is_behind_disk(self) -> bool:
+        """Whether `must_wait` may be true of some message."""
+
+    def must_wait(
+        self, rule: OutRule, topic: str, qos: int, retain: bool, size: int, user: str | None
+    ) -> bool:
+        """Whether the publisher of such a message, of QoS 1 or 2 and so many bytes, should wait
+        until more of what is stored is written."""
+
     def offer(
         self,
         rule: OutRule,
@@ -55,10 +66,15 @@ class Offers(Protocol):
         properties_wire: bytes,
         expires_at: float | None,
         now: float,
+        *,
+        is_acknowledged: bool = True,
+        user: str | None = None,
     ) -> str | None:
         """Take a message for the topic there; returns None, or why it is refused (0x97).
 
-        Times are in seconds of the clock of the backlogs.
+        Times are in seconds of the clock of the backlogs. A message of QoS 1 or 2 that nobody is
+        acknowledged for, and that is not retained here, may be dropped where the disk is too slow.
+        `user` has published it, see `UserShares`.
         """
 
 
@@ -118,7 +134,7 @@ class OutSession:
             self._identity.client_id, _OutLink(self), self._identity
         )
         self._answering = self._broker.attach(
-            answers_client_id(self._settings.name), ReceivingLink(self.take_answer)
+            answers_client_id(self._settings.name), _AnswersLink(self)
         )
         wanted = Subscription(self._rules.answers.local_filter, 0, retain_handling=2)
         self._broker.subscribe(self._answering, wanted)
@@ -192,6 +208,22 @@ class OutSession:
 
     # --- messages ------------------------------------------------------------------------------
 
+    def must_wait(self, message: Message, client_id: str) -> bool:
+        """Whether that client's message of QoS 1 or 2 has to wait for the disk."""
+        found = self._rules.out(message.topic) if client_id not in self._own else None
+        return found is not None and self._must_wait(*found, message, client_id)
+
+    def must_wait_to_answer(self, message: Message, client_id: str) -> bool:
+        """Whether that client's answer to a request from there has to wait for the disk."""
+        rule = self._rules.answers
+        return client_id not in self._own and self._must_wait(rule, "", message, client_id)
+
+    def _must_wait(self, rule: OutRule, topic: str, message: Message, client_id: str) -> bool:
+        session = self._broker.sessions.get(client_id)
+        user = None if session is None else _user_of(session.account)
+        retain = message.retain if rule.retain is None else rule.retain
+        return self._backlog.must_wait(rule, topic, message.qos, retain, message.size, user)
+
     def take(self, message: Message, retain: bool, subscription_ids: list[int] | None) -> None:
         """Offer a message that one of the filters matches."""
         publisher = message.publisher
@@ -243,7 +275,11 @@ class OutSession:
                 properties,
                 expires_at,
                 now,
+                is_acknowledged=_is_acknowledged(publisher_of(message)),
+                user=self._user(message),
             )
+            if self._backlog.is_behind_disk:
+                broker.disk.begin()
         except Exception:
             # The broker contains the fault. What is not in the backlog is not acknowledged.
             message.rejection = PublishRejection(
@@ -257,6 +293,16 @@ class OutSession:
             if message.publisher is not None:
                 reason = f"upstream '{self._settings.name}': {refusal}"
                 message.rejection = PublishRejection(ReasonCode.QUOTA_EXCEEDED, reason)
+
+    def _user(self, message: Message) -> str | None:
+        """Who has published it, see `UserShares`."""
+        publisher = publisher_of(message)
+        if publisher is not None:
+            return _user_of(publisher.account)
+        retained = self._broker.retained
+        if retained.get(message.topic) is None:
+            return None
+        return _user_of(retained.owner(message.topic))
 
     def _properties(self, topic: str, message: Message) -> tuple[str, bytes]:
         """The topic and the encoded properties there."""
@@ -306,12 +352,45 @@ class OutSession:
             return False
 
 
+def _user_of(account: Account) -> str | None:
+    """The user of an account, see `UserShares`; all anonymous clients are one."""
+    return None if account.is_inside else account.username or ""
+
+
+def _is_acknowledged(publisher: Session | None) -> bool:
+    """Whether somebody is acknowledged for what the session publishes with QoS 1 or 2; without a
+    session it is a retained message, and somebody was."""
+    if publisher is None:
+        return True
+    link = publisher.link
+    return link.acknowledges if isinstance(link, InsideLink) else True
+
+
+class _AnswersLink(ReceivingLink):
+    """The link of the session that takes the answers to requests from there, and publishes what
+    comes as answers to requests from here."""
+
+    acknowledges = True
+
+    def __init__(self, owner: OutSession) -> None:
+        super().__init__(owner.take_answer)
+        self._owner = owner
+
+    def must_wait(self, message: Message, client_id: str) -> bool:
+        """Wait with answers, too."""
+        return self._owner.must_wait_to_answer(message, client_id)
+
+
 class _OutLink(ReceivingLink):
     """The link of the session that subscribes to the filters of the rules."""
 
     def __init__(self, owner: OutSession) -> None:
         super().__init__(owner.take)
         self._owner = owner
+
+    def must_wait(self, message: Message, client_id: str) -> bool:
+        """Wait with what would be in memory beyond the limit, because the disk is too slow."""
+        return self._owner.must_wait(message, client_id)
 
     def later(self) -> None:
         """There are more retained messages than one turn may offer."""

@@ -6,7 +6,7 @@ They are put together as bytes, as every message that has waited needs it.
 from __future__ import annotations
 
 from datetime import datetime, timezone
-from math import floor
+from math import floor, inf
 from typing import Final
 
 from appliance.mqtt.codec import Property, decode_varint, encode_string, encode_varint
@@ -25,6 +25,9 @@ _PUBLISHED: Final = (
     + encode_string("2000-01-01T00:00:00.000+00:00")[:2]
 )
 
+#: Seconds by which a time is away from those of another millisecond: more than what is rounded.
+_ROUNDED: Final = 2e-6
+
 
 class PublishProperties:
     """Puts properties together; what consecutive messages have in common is encoded once."""
@@ -32,6 +35,10 @@ class PublishProperties:
     def __init__(self) -> None:
         self._second: int | None = None
         self._until_second = b""
+        #: The last properties with nothing but a time added, what they were published with, and
+        #: from when until when they are the same.
+        self._dated = self._published_with = b""
+        self._since = self._until = inf
 
     def encode(
         self, published: bytes, expiry: int | None, number: int | None, published_at: float | None
@@ -42,15 +49,27 @@ class PublishProperties:
         expiry. `expiry` is the Message Expiry Interval, `number` is told as `id`, and
         `published_at` is a time of the wall clock in seconds.
         """
-        inside = published[decode_varint(published, 0)[1] if published[0] >= 0x80 else 1 :]
+        if expiry is None and number is None and published_at is not None:
+            return self._encode_dated(published, published_at)
+        inside = _without_length(published)
         if expiry is not None:
             inside += _EXPIRY + expiry.to_bytes(4, "big")
         if number is not None:
             inside += _ID + encode_string(f"{number:x}")
         if published_at is not None:
             inside += self._published(published_at)
-        size = len(inside)
-        return (bytes((size,)) if size < 0x80 else encode_varint(size)) + inside
+        return _with_length(inside)
+
+    def _encode_dated(self, published: bytes, at: float) -> bytes:
+        """The properties with that time, which most often are those of the message before."""
+        if not self._since <= at < self._until or published != self._published_with:
+            self._dated = _with_length(_without_length(published) + self._published(at))
+            self._published_with = published
+            start = floor(at * 1000) / 1000
+            self._since, self._until = start + _ROUNDED, start + 0.001 - _ROUNDED
+            if not self._since <= at < self._until:
+                self._until = -inf  # the next one may be of another millisecond
+        return self._dated
 
     def _published(self, at: float) -> bytes:
         """The user property of a time as ISO 8601 has it, in UTC, with milliseconds.
@@ -68,3 +87,12 @@ class PublishProperties:
             text = datetime.fromtimestamp(second, timezone.utc).strftime("%Y-%m-%dT%H:%M:%S.")
             self._until_second = _PUBLISHED + text.encode()
         return b"%b%03d+00:00" % (self._until_second, millisecond)
+
+
+def _without_length(properties: bytes) -> bytes:
+    return properties[decode_varint(properties, 0)[1] if properties[0] >= 0x80 else 1 :]
+
+
+def _with_length(properties: bytes) -> bytes:
+    size = len(properties)
+    return (bytes((size,)) if size < 0x80 else encode_varint(size)) + properties

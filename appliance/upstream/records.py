@@ -64,20 +64,41 @@ class Record:
             self.properties_wire,
         )
 
-    @classmethod
-    def decode(cls, data: bytes) -> Record:
+    @staticmethod
+    def decode(data: bytes) -> Record:
         """The record of these bytes, all of which it must be.
 
         Raises:
             ValueError: these bytes are no record, or of another version of the appliance.
         """
+        return RecordDecoder().decode(data)
+
+
+class RecordDecoder:
+    """Decodes records; rule and topic only where they differ from those of the record before."""
+
+    def __init__(self) -> None:
+        self._texts = b""
+        self._rule_size = 0
+        self._rule = ""
+        self._topic = ""
+
+    def decode(self, data: bytes) -> Record:
+        """See `Record.decode`."""
         if len(data) < _LENGTH or data[0] != VERSION:
             raise ValueError("no record, or one of another version")
+        number: int
+        stored_at: float
+        expires_at: float
+        flags: int
+        rule_size: int
+        topic_size: int
+        properties: int
+        payload: int
         _, number, stored_at, expires_at, flags, rule_size, topic_size, properties, payload = (
             _HEADER.unpack_from(data)
         )
-        topic_at = _LENGTH + rule_size
-        properties_at = topic_at + topic_size
+        properties_at = _LENGTH + rule_size + topic_size
         payload_at = properties_at + properties
         if payload_at + payload != len(data):
             raise ValueError(f"a record of {payload_at + payload} bytes in {len(data)}")
@@ -85,10 +106,14 @@ class Record:
             raise ValueError("a record with invalid fields")
         if not (-math.inf < stored_at < math.inf and expires_at > -math.inf):  # nor NaN
             raise ValueError("a record of no time")
-        return cls(
+        texts = data[_LENGTH:properties_at]
+        if texts != self._texts or rule_size != self._rule_size:
+            rule, topic = texts[:rule_size].decode(), texts[rule_size:].decode()
+            self._texts, self._rule_size, self._rule, self._topic = texts, rule_size, rule, topic
+        return Record(
             number,
-            data[_LENGTH:topic_at].decode(),
-            data[topic_at:properties_at].decode(),
+            self._rule,
+            self._topic,
             data[payload_at:],
             flags & _QOS,
             flags > _QOS,

@@ -83,6 +83,12 @@ def unanswered_filters(filters: Sequence[str]) -> str:
     return f"it has answered nothing to SUBSCRIBE: may this login subscribe to {shown}?"
 
 
+def unanswered_state(settings: UpstreamSettings) -> str:
+    """The broker has closed the connection in place of an answer to the state of the robot."""
+    topic = quote(settings.state_there)
+    return f"it has answered nothing to the robot's state: may this login publish to {topic}?"
+
+
 def _unanswered(settings: UpstreamSettings, server: ServerUrl) -> str:
     """The connection has ended, and nothing has answered CONNECT."""
     if server.websocket:

@@ -32,6 +32,9 @@ _TOPICS: Final = 4096
 #: memory here and in the store.
 SINGLE_OVERHEAD: Final = 600
 
+#: Seconds until what could not be read is read again.
+READ_AGAIN: Final = 1.0
+
 # States of an entry.
 IN_FLIGHT: Final = 0
 AGAIN: Final = 1  # to be sent again, at the front of its rule
@@ -152,6 +155,8 @@ class RuleQueue:
         self.reading: Segment | None = None
         self.arriving: list[tuple[Segment, int, bytes]] | None = None
         self.arriving_size = 0
+        #: The next record of the segment that was read last had no room in memory.
+        self.has_large_next = False
         #: Reading failed; it is tried again at `read_at`.
         self.read_failed = False
         self.read_at = 0.0
@@ -241,15 +246,34 @@ class RuleQueue:
 
     def keep(self, segment: Segment, data: bytes) -> None:
         """Keep an appended or read record in memory: the next one after those in `waiting`."""
-        last = self.last
-        if last is None or last.segment is not segment:
-            # Whatever it had before is settled, and was in memory before the last restart.
-            start = segment.done
-            last = self._hold(segment, start, segment.size - len(data) if start else 0)
+        last = self._last_of(segment, len(data))
         last.loaded += 1
         last.size += len(data)
         self.waiting.append(data)
         self.loaded += len(data) + LOADED_OVERHEAD
+
+    def keep_rest(self, segment: Segment, records: list[bytes], first: int, share: int) -> bool:
+        """`keep` the records of a segment from that one on; False if they exceed the memory."""
+        rest = records[first:] if first else records
+        size = sum(map(len, rest))
+        memory = size + len(rest) * LOADED_OVERHEAD
+        if not rest or self.loaded + memory > share:
+            return False
+        last = self._last_of(segment, len(rest[0]))
+        last.loaded += len(rest)
+        last.size += size
+        self.waiting.extend(rest)
+        self.loaded += memory
+        return True
+
+    def _last_of(self, segment: Segment, size: int) -> HeldSegment:
+        """What is held of a segment whose next record, of that size, is about to be kept."""
+        last = self.last
+        if last is None or last.segment is not segment:
+            # Whatever it had before is settled, and was in memory before the last restart.
+            start = segment.done
+            last = self._hold(segment, start, segment.size - size if start else 0)
+        return last
 
     def _hold(self, segment: Segment, start: int, size: int) -> HeldSegment:
         self.last = held = HeldSegment(segment, start, size)
@@ -292,6 +316,7 @@ class RuleQueue:
         """The segment is going to be read."""
         assert self.journal is not None
         self.reading = segment
+        self.has_large_next = False
         if self.spilled is segment:
             self.spilled = None
         self.arriving = [] if self.journal.segments()[-1] is segment else None
@@ -319,9 +344,11 @@ class RuleQueue:
         data = self.waiting.popleft()
         self.loaded -= len(data) + LOADED_OVERHEAD
         part = self.held[0]
-        while (index := part.first()) == part.loaded:
-            self.held.popleft()
-            part = self.held[0]
+        index = part.next
+        if index == part.loaded or index < part.done or part.settled:
+            while (index := part.first()) == part.loaded:
+                self.held.popleft()
+                part = self.held[0]
         part.next = index + 1
         return data, part, index
 
@@ -358,6 +385,7 @@ class RuleQueue:
         """Drop what is not in memory of the oldest segment of which something is not: the number of
         its records, and their bytes."""
         assert self.journal is not None
+        self.has_large_next = False
         if segment is None:
             self.behind = False
             return 0, 0

@@ -82,7 +82,8 @@ class Sender:
         self._backlog = backlog
         self._clock = clock
         #: Of the kind of broker, and of the present connection.
-        self._of_kind = self._limits = limits
+        self._of_kind = limits
+        self._use(limits)
         #: The oldest message in flight when the last connection ended, and of how many in a row
         #: that was so.
         self._stuck_on = -1
@@ -105,9 +106,15 @@ class Sender:
 
     def begin(self, limits: FleetLimits) -> None:
         """A connection is up, with these limits."""
-        self._limits = limits
+        self._use(limits)
         self._topics.clear()
         self._backlog.connected(limits.packet_size)
+
+    def _use(self, limits: FleetLimits) -> None:
+        self._limits = limits
+        # What each message is compared with.
+        self._packet_size = limits.packet_size
+        self._qos, self._may_retain = limits.qos, limits.retain
 
     def send(self, connection: FleetConnection[Entry | None]) -> bool:
         """Hand messages to the connection; True if there may be more for another turn."""
@@ -115,6 +122,7 @@ class Sender:
         wall = time.time()
         # A date from a clock that was not set is worse than none.
         offset = None if wall < _RELEASED else wall - now
+        is_v5 = connection.settings.version == V5
         left = SENT_PER_TURN
         while left > 0:
             room, size = connection.room, WRITE_PORTION - connection.waiting
@@ -128,7 +136,7 @@ class Sender:
             left -= len(entries)
             for place, entry in enumerate(entries):
                 try:
-                    self._publish(connection, entry, offset)
+                    self._publish(connection, entry, offset, is_v5)
                 except BaseException:
                     self._backlog.put_back(entries[place + 1 :])
                     raise
@@ -141,14 +149,18 @@ class Sender:
         return None if due is None else max(0.0, due - now)
 
     def _publish(
-        self, connection: FleetConnection[Entry | None], entry: Entry, offset: float | None
+        self,
+        connection: FleetConnection[Entry | None],
+        entry: Entry,
+        offset: float | None,
+        is_v5: bool,
     ) -> None:
         """Hand one to the connection; the wall clock is ahead of the backlog's by `offset`: None
         where it is not set."""
         record = entry.record
-        topic, payload, limits = record.topic, record.payload, self._limits
+        topic, payload = record.topic, record.payload
         properties = NO_PROPERTIES
-        if connection.settings.version == V5:
+        if is_v5:
             properties = record.properties_wire
             at, number = entry.published_at, record.number if record.qos == 2 else None
             if at is not None:
@@ -157,18 +169,18 @@ class Sender:
                 properties = self._properties.encode(properties, entry.expiry, number, at)
         topic_size, why = self._topics.get(topic) or self._look_at(topic)
         size = HEADER_SIZE + topic_size + len(properties) + len(payload)
-        if why or size > limits.packet_size:
-            why = limits.unsendable(topic, size)
+        if why or size > self._packet_size:
+            why = self._limits.unsendable(topic, size)
             # The kind of broker never takes it; or this connection, and perhaps a later one does.
             is_for_now = not self._of_kind.unsendable(topic, size)
             # With a limit below its payload it need not be tried again: each try writes it anew.
-            too_small = max(limits.packet_size, len(payload))
-            if is_for_now and self._backlog.hold(entry, too_small):
+            too_small = max(self._packet_size, len(payload))
+            if is_for_now and self._backlog.hold(entry, too_small, self._clock()):
                 return
             self._set_aside(entry, f"the fleet's broker does not take it: {why}")
             return
-        qos = min(entry.qos, limits.qos)
-        retain = record.retain and limits.retain
+        qos = min(entry.qos, self._qos)
+        retain = record.retain and self._may_retain
         code = connection.publish(entry, topic, payload, qos, retain, properties)
         if code:
             self._set_aside(entry, f"the fleet's broker does not take it: {reason_words(code)}")

@@ -85,7 +85,8 @@ def warnings_of(status: dict[str, Any]) -> Iterator[str]:
         )
     if status["forgotten"]:
         yield (
-            "messages of QoS 0 that waited in memory were lost when its section was reloaded: "
+            "messages of QoS 0 that waited in memory were lost when its section was reloaded, as "
+            "nothing could be stored: "
             f"{status['forgotten']}"
         )
     if status["set_aside"]:

@@ -35,16 +35,13 @@ from appliance.upstream.in_session import InCounters, InSession
 from appliance.upstream.limits import KINDS
 from appliance.upstream.line import AGAIN, Line
 from appliance.upstream.out_session import OutSession
-from appliance.upstream.presence import Presence, presence_messages
+from appliance.upstream.presence import Presence
 from appliance.upstream.readiness import Readiness
-from appliance.upstream.refusals import (
-    reason_words,
-    state_advice,
-    subscription_advice,
-)
+from appliance.upstream.refusals import reason_words, subscription_advice
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import LinkRules, UpstreamSettings
 from appliance.upstream.sender import Sender
+from appliance.upstream.state_report import StateReport
 from appliance.upstream.status import LinkStatus, bottleneck
 from appliance.upstream.transport import Surroundings
 
@@ -91,7 +88,7 @@ class Uplink:
         self._scheduler = parts.scheduler
         self._loop = parts.entries.loop
         self._rules = LinkRules(settings)
-        self._presence = presence_messages(settings)
+        self._state = StateReport(settings)
         # Who waits for an answer to a call under way waits for one from this link.
         self._answers = Answers(settings)
         if before is not None and before._answer_topics == self._answer_topics:
@@ -132,12 +129,6 @@ class Uplink:
         if any(rule.offline == "keep" for rule in settings.inward):
             self._lines.append(Line(link, is_kept=True))
         self._offered, self._sent = Meter(), Meter()
-        #: On the present connection: whether the state is still to be published there, and whether
-        #: the broker has answered that.
-        self._state_due = False
-        self._is_settled = False
-        #: Why the broker did not take it the last time.
-        self._state_refusal: str | None = None
         self._clock: PeriodicCallback | None = None
         self._send_timer: asyncio.TimerHandle | None = None
         self._send_at = 0.0
@@ -181,15 +172,20 @@ class Uplink:
         if is_last or not is_named:
             self._publish_here(b"" if is_last else self._reported, b"" if not is_named else b"0")
         self._out.detach()
+        self._backlog.store()
         self.broker.flush()
 
     def _tick(self) -> None:
         self._backlog.tick(self._journal_clock())
         self._sender.tick()
         counts = self._backlog.counts()
-        for line in self._lines:
-            line.tick()
         now = self._loop.time()
+        online = self._lines[0]
+        for line in self._lines:
+            if line is not online or self._state.is_settled:  # an end has one reason
+                line.tick()
+        if online.channel is not None:
+            self._state.tick(online.channel, online.position, now)
         self._offered.tick(now, counts.offered)
         self._sent.tick(now, counts.sent)
         if now >= self._reported_at + REPORT_INTERVAL:
@@ -244,10 +240,8 @@ class Uplink:
         """See `ChannelOwner`."""
         if channel is not self._lines[0].channel or not channel.can_send:
             return
-        if self._state_due and channel.connection.room:
-            self._state_due = False
-            self.publish_state(channel, Presence.ONLINE)
-        if not self._is_settled:
+        self._state.send(channel)
+        if not self._state.is_settled:
             return  # so that an end of the connection is not taken for that of a message
         if self._sender.send(channel.connection):
             self._send_later(0.0)
@@ -259,14 +253,7 @@ class Uplink:
     def acknowledged(self, entries: list[Entry | None], code: int, reason: str) -> None:
         """See `ChannelOwner`."""
         if None in entries:  # the state
-            self._is_settled = True
-            self._state_refusal = None
-            if code >= 0x80:
-                self._state_refusal = (
-                    f"the fleet's broker refuses {quote(self.settings.state_there)}: "
-                    f"{reason_words(code)}; {state_advice(code, self.settings)}"
-                )
-                log.warning("%s: %s", self, self._state_refusal)
+            self._state.acknowledged(self._lines[0].position, code, self._loop.time())
         self._sender.acknowledged(entries, code, reason)
 
     # --- the connections -----------------------------------------------------------------------
@@ -293,7 +280,7 @@ class Uplink:
         line.on_opened(channel)
         if line.is_kept:
             return
-        self._state_due = self._is_settled = False
+        self._state.opened()
         granted = channel.connection.granted
         assert granted is not None
         self._out.version = channel.version
@@ -313,43 +300,33 @@ class Uplink:
                 subscription_advice(code, self.settings, each.filter),
             )
         if not line.is_kept and not channel.is_subscribed:
-            self._state_due = True  # as soon as the window has room
+            self._state.subscribed(line.position)
         self._report()
 
     def ended(self, channel: Channel, ending: Ending) -> None:
         """See `ChannelOwner`."""
         line = self._line_of(channel)
         is_answered = channel.is_subscribed and not channel.unanswered
-        is_causeless = ending.is_close and is_answered
+        is_causeless, advice = ending.is_close and is_answered, ""
         try:
             if not line.is_kept:
+                state, now = self._state, self._loop.time()
                 inflight = channel.connection.unsettled()
-                was_settled = self._is_settled and is_answered
+                was_settled = state.is_settled and is_answered
                 is_stuck = self._sender.end(ending, inflight, was_settled=was_settled)
-                is_causeless = is_causeless and self._is_settled and not is_stuck
-                # mosquitto 2.0 with `max_queued_messages 0` closes behind a refused message.
-                is_causeless = is_causeless and self._state_refusal is None
+                is_causeless = is_causeless and state.is_settled and not is_stuck
+                is_causeless = is_causeless and not state.is_refused
+                advice = state.ended(channel, ending, line.position, now, is_answered=is_answered)
         finally:
-            line.on_ended(ending, is_causeless=is_causeless)
+            line.on_ended(ending, is_causeless=is_causeless, advice=advice)
         self._report()
 
     def _line_of(self, channel: Channel) -> Line:
         return self._lines[channel.is_kept]
 
-    def publish_state(self, channel: Channel, presence: Presence) -> None:
-        """Say there whether the robot is online; the will says when it is not any more."""
-        connection = channel.connection
-        granted = connection.granted
-        if granted is None:
-            return
-        limits = KINDS[self.settings.kind]
-        # With QoS 0 where the window has no room: before the end, nothing else will follow.
-        qos = min(1, granted.maximum_qos, connection.room)
-        retain = granted.retain and limits.retain
-        state = self._presence.payload(presence)
-        connection.publish(None, self.settings.state_there, state, qos, retain)
-        if not qos:
-            self._is_settled = True
+    def say_offline(self, channel: Channel) -> None:
+        """See `LineOwner`."""
+        self._state.leave(channel)
 
     def client_id(self, *, is_kept: bool) -> str:
         """The client id there of one of the connections."""
@@ -368,7 +345,7 @@ class Uplink:
         limits = KINDS[settings.kind]
         will = None
         if not is_kept:
-            state = self._presence.payload(Presence.BROKEN)
+            state = self._state.payload(Presence.BROKEN)
             qos = 0 if ReasonCode.QOS_NOT_SUPPORTED in refused else min(1, limits.qos)
             retain = limits.retain and ReasonCode.RETAIN_NOT_SUPPORTED not in refused
             will = Will(settings.state_there, state, qos, retain)
@@ -425,6 +402,12 @@ class Uplink:
 
     # --- status --------------------------------------------------------------------------------
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether the fleet's broker has accepted it, for all rules."""
+        channels = [line.channel for line in self._lines]
+        return all(each is not None and each.connection.granted is not None for each in channels)
+
     def status(self) -> LinkStatus:
         """How the link is now."""
         settings, line = self.settings, self._lines[0]
@@ -469,7 +452,7 @@ class Uplink:
         status.missing_filters = [each for line in self._lines for each in line.missing_filters]
         status.forgotten = self._forgotten
         status.denied = dict(self._out.denied)
-        status.state_refusal = self._state_refusal
+        status.state_refusal = self._state.refusal
         status.advice = bottleneck(status)
         return status
 

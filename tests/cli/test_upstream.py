@@ -10,7 +10,7 @@ import yaml
 
 from appliance.cli import main as cli
 from appliance.ops import control
-from appliance.upstream.backlog import DropReason
+from appliance.upstream.backlog_counts import DropReason
 from appliance.upstream.status import LinkStatus
 
 LINK = LinkStatus(
@@ -33,7 +33,7 @@ def test_each_thing_to_know_is_a_line_of_its_own(
     (tmp_path / "appliance.yaml").write_text(yaml.safe_dump({"robot": "r2"}))
     (tmp_path / "broken.yaml").write_text("robott: r2")
     links = [{**asdict(LINK), "aside": [ASIDE]}]
-    monkeypatch.setattr(control, "ask", lambda *_: links)
+    monkeypatch.setattr(control, "ask", lambda *_, **__: links)
     with pytest.raises(SystemExit):  # what is in force is shown, whatever the file says
         cli.main(["upstream", "-c", str(tmp_path / "broken.yaml")])
     shown = capsys.readouterr()

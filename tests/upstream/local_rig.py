@@ -60,6 +60,8 @@ class Offered:
             decode_properties(properties, 0, len(properties), PacketType.PUBLISH)[0] or {}
         )
         self.expires_in: float | None = None
+        self.is_acknowledged = True
+        self.user: str | None = None
 
 
 class FakeBacklog:
@@ -68,8 +70,15 @@ class FakeBacklog:
     def __init__(self) -> None:
         self.offers: list[Offered] = []
         self.is_full = False
+        self.is_behind_disk = False
         self.fault: Exception | None = None
         self.staged: Callable[[], None] = lambda: None
+
+    def must_wait(
+        self, rule: OutRule, topic: str, qos: int, retain: bool, size: int, user: str | None
+    ) -> bool:
+        assert user == "user"
+        return self.is_behind_disk
 
     def offer(
         self,
@@ -81,12 +90,16 @@ class FakeBacklog:
         properties_wire: bytes,
         expires_at: float | None,
         now: float,
+        *,
+        is_acknowledged: bool = True,
+        user: str | None = None,
     ) -> str | None:
         if self.fault is not None:
             raise self.fault
         if self.is_full:
             return "it is full"
         offered = Offered(rule, topic, payload, qos, retain, properties_wire)
+        offered.is_acknowledged, offered.user = is_acknowledged, user
         offered.expires_in = None if expires_at is None else expires_at - now
         self.offers.append(offered)
         self.staged()

@@ -384,7 +384,7 @@ class RabbitMQ(Peer):
             self.erlang.stop()
 
 
-#: May publish below `fleet/r2d2/events/`, but not `secret`, and to the state of the link, and
+#: May publish below `fleet/r2d2/events/`, but not `secret`, nor to the state of the link, and
 #: subscribe to `fleet/r2d2/cmd/#`. In topics RabbitMQ has a dot for a slash.
 LIMITED = "limited"
 
@@ -400,7 +400,7 @@ _DEFINITIONS = {
             "user": LIMITED,
             "vhost": "/",
             "exchange": "amq.topic",
-            "write": r"^fleet\.r2d2\.(events\.(?!secret)|_appliance\.)",
+            "write": r"^fleet\.r2d2\.events\.(?!secret)",
             "read": r"^fleet\.r2d2\.cmd\.",
         }
     ],

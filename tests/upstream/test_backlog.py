@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import Counter
 
@@ -10,14 +11,14 @@ import pytest
 from appliance.broker.backlogs import RecordsLostError
 from appliance.mqtt.codec import NO_PROPERTIES
 from appliance.upstream import backlog as module
+from appliance.upstream import live_messages
 from appliance.upstream.backlog import (
-    LATEST_SIZE,
     MOST_LATER,
-    UNWRITTEN_SIZE,
     Backlog,
-    BacklogCounts,
-    DropReason,
 )
+from appliance.upstream.backlog_counts import BacklogCounts, DropReason
+from appliance.upstream.disk_room import UNWRITTEN_AWAITED, UNWRITTEN_FROM_ROS, UNWRITTEN_SIZE
+from appliance.upstream.live_messages import LATEST_SIZE
 from appliance.upstream.rule_queue import LOADED_OVERHEAD, Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
 from appliance.upstream.set_aside import ASIDE_SIZE
@@ -77,12 +78,23 @@ class Link:
         of: int = 0,
         retain: bool = False,
         expires_in: float | None = None,
+        is_acknowledged: bool = True,
+        user: str | None = None,
     ) -> str | None:
         data = payload.encode() if isinstance(payload, str) else payload
         now = self.backlogs.time
         expires_at = None if expires_in is None else now + expires_in
         return self.backlog.offer(
-            self.rules[of], topic, data, qos, retain, NO_PROPERTIES, expires_at, now
+            self.rules[of],
+            topic,
+            data,
+            qos,
+            retain,
+            NO_PROPERTIES,
+            expires_at,
+            now,
+            is_acknowledged=is_acknowledged,
+            user=user,
         )
 
     def next(self) -> Entry | None:
@@ -224,6 +236,17 @@ def test_lanes() -> None:
     assert Counter(order) == {"h": 64, "n": 64, "l": 64}
 
 
+def test_where_nothing_waits_in_other_lanes_a_turn_is_one_run() -> None:
+    link = Link(rule("a"), rule("b", priority="low"), rule("c", priority="high"))
+    for number in range(100):
+        link.offer(f"{number}", of=0)
+    now = link.backlogs.time
+    assert len(link.backlog.take(now, 64, 1 << 20)) == 64
+    link.offer("low", of=1)
+    order = [each.record.payload for each in link.backlog.take(now, 64, 1 << 20) + link.take()]
+    assert order.index(b"low") < 16 and len(order) == 37
+
+
 def test_rules_of_a_lane_are_sent_in_the_order_of_publishing() -> None:
     link = Link(rule("a"), rule("b"), rule("c"))
     expected = []
@@ -292,6 +315,29 @@ def test_the_latest_one_survives_a_kill(qos: int) -> None:
     link.backlogs.commit()
     link.restart()
     assert link.drain() == ["2"]
+    link.backlogs.commit()
+    link.restart()
+    assert link.drain() == []
+
+
+def test_the_latest_of_qos_0_survives_an_orderly_stop_and_is_in_memory_again() -> None:
+    link = Link(rule(keep="latest"), online=False)
+    link.offer("0", "before", qos=0)
+    link.offer("1", "sent", qos=0)
+    link.offer("2", "retained", qos=0, retain=True)
+    link.backlog.store()
+    link.backlogs.commit()
+    link.restart()
+    assert link.counts().restored == 3
+    link.offer("3", "before", qos=0)  # in memory, as long as the appliance runs
+    assert link.drain() == ["3", "1", "2"]
+    link.backlogs.commit()
+    link.restart()
+    assert link.drain() == []
+    link.offer("4", "lost", qos=0)
+    link.backlogs.failing = True
+    link.backlog.store()
+    link.backlogs.failing = False
     link.backlogs.commit()
     link.restart()
     assert link.drain() == []
@@ -530,6 +576,86 @@ def test_no_more_of_qos_0_is_taken_than_the_disk_takes(caplog: pytest.LogCapture
     assert sorted(sent) == sorted(["before", "normal", "acknowledged", "in memory", large])
 
 
+def test_what_waits_for_the_disk_is_bounded_and_leaves_room_for_what_is_acknowledged() -> None:
+    """By lane: messages from ROS are dropped, publishers that are acknowledged wait."""
+    rules = rule("h", priority="high"), rule("n"), rule("l", priority="low"), rule("t", "latest")
+    link = Link(*rules, rule("x", "none"))
+    large = LATEST_SIZE + 1
+
+    def waiting(size: int = 10, qos: int = 1, retain: bool = False) -> str:
+        asked = zip("hnltx", link.rules, strict=True)
+        return "".join(
+            name
+            for name, each in asked
+            if link.backlog.must_wait(each, "fleet/t", qos, retain, size)
+        )
+
+    for lane in range(3):
+        link.backlogs.unwritten = UNWRITTEN_FROM_ROS[lane] - 1
+        assert not waiting() and link.offer("kept", of=lane, is_acknowledged=False) is None
+        link.backlogs.unwritten += 1
+        assert link.offer("dropped", of=lane, is_acknowledged=False) is None
+        link.offer("acknowledged", of=lane)
+    assert link.dropped() == {"disk": 3} and link.drain().count("acknowledged") == 3
+    waits = []
+    for size in reversed(UNWRITTEN_AWAITED):
+        link.backlogs.unwritten = size - 1
+        waits.append(waiting())
+    assert waits == ["", "l", "nl"]
+    link.backlogs.unwritten = UNWRITTEN_AWAITED[0]
+    assert link.backlog.is_behind_disk and waiting(qos=2) == "hnl"
+    assert waiting(retain=True) == ""  # as the latest one of its topic it is in memory
+    assert waiting(large) == "hnlt" and waiting(large, retain=True) == "hnlt"
+    link.backlogs.failing = True  # then it is refused
+    assert not waiting() and not link.backlog.is_behind_disk
+
+
+@pytest.mark.parametrize("trouble", ["failing", "slow"])
+def test_nothing_is_stored_in_another_place_while_the_disk_is_behind(trouble: str) -> None:
+    link = Link(rule(), rule("later"))
+    link.backlog.connected(10)
+    link.offer("too large")
+    link.offer("refused", of=1)
+    link.backlogs.commit()
+    link.backlogs.failing = trouble == "failing"
+    link.backlogs.unwritten = 0 if link.backlogs.failing else UNWRITTEN_SIZE[2]
+    records = {lane: len(each.records) for lane, each in link.backlogs.journals.items()}
+    rows = dict(link.backlogs.latest_records.rows)
+    for _ in range(5):
+        for entry in link.take():
+            if entry.record.payload == b"refused":
+                link.backlog.retry_later(entry, link.backlogs.time)
+            else:
+                assert link.backlog.hold(entry, 10, link.backlogs.time)
+        assert link.next() is None
+        link.backlogs.time = link.backlog.due(link.backlogs.time) or math.inf
+    assert records == {lane: len(each.records) for lane, each in link.backlogs.journals.items()}
+    assert rows == link.backlogs.latest_records.rows
+    assert (link.counts().held, link.counts().waiting) == (0, 2)
+    link.backlogs.commit()
+    link.restart()  # both are still there
+    assert sorted(link.drain()) == ["refused", "too large"]
+    link.offer("too large")
+    (entry,) = link.take()
+    assert link.backlog.hold(entry, 10, link.backlogs.time)
+    assert link.counts().held == 1
+
+
+def test_values_that_were_read_hold_up_no_larger_one_before_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A large state comes in place of a small one that had been read with those behind it."""
+    monkeypatch.setattr(live_messages, "LATEST_SIZE", 0)
+    link = Link(rule(keep="latest"))
+    link.offer("small", "a")
+    link.offer("b", "b")
+    assert link.backlog.next(link.backlogs.time) is None
+    link.backlogs.turn()
+    large = "x" * live_messages.VALUES_SIZE
+    link.offer(large, "a")
+    assert link.drain() == [large, "b"]
+
+
 @pytest.mark.parametrize("commits", [2, 7, 1000])
 def test_an_outage_keeps_exactly_the_newest(commits: int) -> None:
     backlogs = PlainBacklogs(segment_size=4096)
@@ -608,6 +734,33 @@ def test_a_rule_that_is_refused_holds_up_itself_alone(size: int) -> None:
         sent = link.drain()
         assert sent == [f"alarm {number}", f"{number}"]
     assert link.counts().waiting == 3 * MOST_LATER
+
+
+def test_large_messages_that_wait_hold_up_no_large_one_of_another_rule() -> None:
+    """With many rules each may have little in memory; nor is the same read again and again."""
+    others = [rule(f"r{number}") for number in range(40)]
+    link = Link(rule("low", "all", "low"), rule("alarms", "all", "high"), *others)
+    link.backlog.connected(50_000)
+
+    def first() -> Entry | None:
+        for _ in range(200):
+            entry = link.backlog.next(link.backlogs.time)
+            if entry is not None or not link.backlogs.rounds:
+                return entry
+            link.backlogs.turn()
+        raise AssertionError(f"{link.backlogs.reads} reads")
+
+    for number in range(20):
+        link.offer(f"{number}".ljust(100_000))
+    while (entry := first()) is not None:
+        assert link.backlog.hold(entry, 50_000, link.backlogs.time)
+    link.backlog.rewind()
+    link.backlog.connected(50_000)
+    assert first() is None  # they are too large for this connection as well
+    link.offer("alarm".ljust(40_000), of=1)
+    entry = first()
+    assert entry is not None and entry.record.payload.startswith(b"alarm")
+    assert link.backlogs.reads < 100
 
 
 def test_a_latest_one_is_not_tried_again_after_a_newer_one() -> None:
@@ -854,7 +1007,7 @@ def test_what_is_too_large_for_now_waits_for_a_connection_that_takes_it() -> Non
         sent: list[str] = []
         while (entry := link.next()) is not None:
             name = entry.record.payload.decode()
-            if len(name) > limit and link.backlog.hold(entry, limit):
+            if len(name) > limit and link.backlog.hold(entry, limit, link.backlogs.time):
                 continue
             assert len(name) <= limit
             sent.append(name.rstrip())
@@ -881,7 +1034,7 @@ def test_what_is_too_large_for_now_waits_for_a_connection_that_takes_it() -> Non
     link.offer("x", of=1)  # of which only the latest counts
     link.backlog.connected(0)
     entry = link.next()
-    assert entry is not None and not link.backlog.hold(entry, 0)
+    assert entry is not None and not link.backlog.hold(entry, 0, link.backlogs.time)
 
 
 def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no_more() -> None:
@@ -889,7 +1042,7 @@ def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no
     link.backlog.connected(10)
     link.offer("x" * 50)
     entry = link.next()
-    assert entry is not None and link.backlog.hold(entry, 10)
+    assert entry is not None and link.backlog.hold(entry, 10, link.backlogs.time)
     assert link.next() is None
     link.backlog.rewind()
     for _ in range(2):
@@ -925,7 +1078,7 @@ def test_what_too_many_are_too_large_for_is_not_kept() -> None:
         assert link.offer("x" * 900) is None
         entry = link.next()
         assert entry is not None
-        if link.backlog.hold(entry, 100):
+        if link.backlog.hold(entry, 100, link.backlogs.time):
             held += 1
         else:
             link.backlog.set_aside(entry, "too large", link.backlogs.time)
@@ -943,7 +1096,7 @@ def test_what_is_too_large_is_tried_on_each_connection_that_takes_more() -> None
             most -= 1
             size = len(entry.record.payload)
             if size > limit:
-                assert link.backlog.hold(entry, limit)
+                assert link.backlog.hold(entry, limit, link.backlogs.time)
             else:
                 sent.append(size)
                 link.backlog.settle(entry)
@@ -1025,8 +1178,8 @@ def test_what_memory_had_no_room_for_does_not_come_back_after_a_newer_one(
 
 def test_more_topics_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest of the lowest lane go, of all rules of the link; or the publisher is told."""
-    monkeypatch.setattr(module, "LATEST_SIZE", 5_000)
-    monkeypatch.setattr(module, "TOPICS_SIZE", 10_000)
+    monkeypatch.setattr(live_messages, "LATEST_SIZE", 5_000)
+    monkeypatch.setattr(live_messages, "TOPICS_SIZE", 10_000)
     rules = rule(keep="latest"), rule("b", keep="latest"), rule("h", "latest", "high")
     link = Link(*rules, online=False)
     for number in range(100):
@@ -1040,6 +1193,62 @@ def test_more_topics_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -
     told = [link.offer(f"{number}", f"t{number}", of=number % 2) for number in range(100)]
     assert told.index(next(each for each in told if each)) == waiting
     assert link.counts().waiting == waiting
+
+
+@pytest.mark.parametrize("scarce", ["size", "topics", "memory"])
+def test_the_states_of_one_user_do_not_take_away_those_of_others(
+    monkeypatch: pytest.MonkeyPatch, scarce: str
+) -> None:
+    limits = {"size": 1 << 28}
+    if scarce == "size":
+        limits["size"] = 1_000_000
+    elif scarce == "topics":
+        monkeypatch.setattr(live_messages, "LATEST_SIZE", 5_000)
+        monkeypatch.setattr(live_messages, "TOPICS_SIZE", 100_000)
+    rules = rule(keep="latest"), rule("b", keep="latest"), rule("all", keep="all")
+    link = Link(*rules, online=False, **limits)
+    small, large = "s".ljust(1000), "l".ljust(10_000 if scarce == "size" else 100_000)
+    if scarce == "topics":
+        small, large = "s", "l"
+
+    def state(number: int, user: str | None, *, of: int = 0) -> None:
+        link.offer(small, f"{user}/{number}", qos=number % 2, of=of, user=user)
+
+    for number in range(10):
+        state(number, "alice", of=number % 2)
+        state(number, None)
+    for number in range(10):
+        link.offer(small, f"all {number}", of=2, user="alice")
+    for number in range(500):
+        link.offer(large, f"flood/{number}", qos=0, of=number % 2, user="mallory")
+    if scarce == "memory":
+        link.backlogs.unwritten = UNWRITTEN_SIZE[0]  # and what is for the disk has no room
+    for number in range(10):
+        state(number, "bob", of=number % 2)
+        state(number, "alice", of=number % 2)
+    link.backlogs.unwritten = 0
+    link.backlog.connected()
+    sent: Counter[str] = Counter()
+    while found := link.take(100):
+        for entry in found:
+            sent[entry.record.topic.partition("/")[0].partition(" ")[0]] += 1
+            link.backlog.settle(entry)
+    flood = sent.pop("flood")
+    assert sent == {"alice": 10, "None": 10, "all": 10, "bob": 10}
+    assert flood > 20 and (scarce == "memory" or flood < 400)
+    assert not link.backlog._live._shares.largest() and link.counts().waiting == 0
+
+
+def test_a_user_alone_may_take_all_the_room_and_the_one_with_more_yields() -> None:
+    link = Link(rule(keep="latest"), online=False, size=1_000_000)
+    for number in range(99):
+        link.offer("x".ljust(9_900), f"a/{number}", user="a")
+    assert link.dropped() == {}
+    for number in range(30):
+        link.offer("x".ljust(9_900), f"b/{number}", user="b")
+    link.backlog.connected()
+    left = Counter(entry.record.topic[0] for entry in link.take(1000))
+    assert left == {"a": 70, "b": 30}
 
 
 def test_a_value_that_cannot_be_read_is_read_again_and_a_damaged_one_is_counted(

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from appliance.upstream import backlog as module
-from appliance.upstream.backlog import DropReason
+from appliance.upstream import live_messages
+from appliance.upstream.backlog_counts import DropReason
 from appliance.upstream.rule_queue import ENTRY_OVERHEAD, GONE, LATER, Entry
 from appliance.upstream.rules import OutRule
 from upstream.plain_backlogs import PlainBacklogs
@@ -424,8 +425,8 @@ def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most of what waits is only on disk."""
     monkeypatch.setattr(module, "LOADED_SIZE", 1500)
     monkeypatch.setattr(module, "LOADED_SHARE", 300)
-    monkeypatch.setattr(module, "LATEST_SIZE", 1200)
-    monkeypatch.setattr(module, "VALUES_SIZE", 300)
+    monkeypatch.setattr(live_messages, "LATEST_SIZE", 1200)
+    monkeypatch.setattr(live_messages, "VALUES_SIZE", 300)
 
 
 def _compare(twin: Twin, seed: int, operations: list[str]) -> None:
@@ -484,7 +485,7 @@ def test_what_is_too_large_for_one_server_goes_to_another(seed: int) -> None:
                 waiting.remove(size)
                 link.backlog.settle(entry)
             elif choose.random() < 0.9:
-                assert link.backlog.hold(entry, limit)
+                assert link.backlog.hold(entry, limit, link.backlogs.time)
             else:
                 left = 0  # the connection ends before
         link.backlog.rewind()
@@ -613,7 +614,7 @@ class Pair:
             assert each._later_size == sum(entry.size + ENTRY_OVERHEAD for entry in later)
             assert sum(queue.later for queue in each._queues.values()) == len(later)
         sizes = [
-            (each._flying_size, each._again_size, each._live_size, each._messages, each._bytes)
+            (each._flying_size, each._again_size, each._live.memory)
             for each in (link.backlog for link in self.links)
         ]
         assert sizes[0] == sizes[1]

@@ -47,7 +47,7 @@ def test_the_latest_of_many_topics_are_bounded() -> None:
     tracemalloc.start()
     try:
         for number in range(20_000):
-            link.offer(bytes(300), f"fleet/state/{number}", qos=0)
+            link.offer(bytes(300), f"fleet/state/{number}", qos=0, user="user")
         taken = allocated()
     finally:
         tracemalloc.stop()

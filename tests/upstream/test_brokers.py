@@ -16,7 +16,7 @@ from waiting import until
 from appliance.mqtt.codec import V5, V311, Properties, Property
 from appliance.mqtt.packets import Puback, Pubcomp, Publish, Pubrec, Pubrel, Suback, Subscribe
 from appliance.mqtt.packets import Subscription as Filter
-from appliance.upstream import backoff
+from appliance.upstream import backoff, unanswered
 from upstream.client import MqttClient
 from upstream.peers import (
     HOST,
@@ -174,8 +174,11 @@ def is_subscribed(rig: Rig) -> bool:
     return channel is not None and channel.is_subscribed
 
 
-async def test_what_rabbitmq_does_not_allow(rabbitmq: RabbitMQ, tmp_path: Path) -> None:
+async def test_what_rabbitmq_does_not_allow(
+    rabbitmq: RabbitMQ, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It closes the connection, and says why nowhere but in its log."""
+    monkeypatch.setattr(unanswered, "LIVED", 0.5)
     kind = {"kind": "rabbitmq", "version": "3.1.1"}
     async with running(link(tmp_path, rabbitmq.plain_port, password="no", **kind)) as rig:
         await until(lambda: "Bad user name or password" in (rig.status().problem or ""))
@@ -187,6 +190,7 @@ async def test_what_rabbitmq_does_not_allow(rabbitmq: RabbitMQ, tmp_path: Path) 
         await there.subscribe("fleet/r2d2/events/#")
         await until(lambda: "fleet/r2d2/other/#" in (rig.status().problem or ""))
         await until(lambda: rig.status().missing_filters == ["fleet/r2d2/other/#"])
+        await until(lambda: "_appliance/state" in (rig.status().state_refusal or ""))
         await until(lambda: is_subscribed(rig), "the other filter to be granted")
         here = await local(rig, "r2d2/cmd/#")
         await there.publish("fleet/r2d2/cmd/go", b"in")

@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from broker.conftest import FakeStore, lasting
+from broker.conftest import FakeStore, Peer, lasting
 
 from appliance.broker.broker import Broker
 from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.session import REPLAYED_PER_TURN
-from appliance.mqtt.codec import V311, Property
-from appliance.mqtt.packets import Puback, Publish
+from appliance.broker.values import Identity
+from appliance.mqtt.codec import V5, V311, Property
+from appliance.mqtt.packets import Pingreq, Pingresp, Puback, Publish, Pubrec, Subscription
 from appliance.mqtt.reason import ReasonCode
 
 from .local_rig import ACL, Rig, user_properties
@@ -53,6 +54,7 @@ def test_what_the_rules_carry_is_offered_as_it_is_there(rig: Rig) -> None:
         "latest",
     )
     assert map_.expires_in is None
+    assert [door.user, map_.user] == ["user", "user"]
     assert rig.out.counters.offered == 2
 
 
@@ -129,7 +131,7 @@ def test_retained_messages_are_offered_once_in_turns(rig: Rig) -> None:
     while rig.turns:
         rig.turn()
     offered = rig.backlog.offers
-    assert all(each.retain and each.qos == 1 for each in offered)
+    assert all(each.retain and each.qos == 1 and each.user == "user" for each in offered)
     latest = {each.topic: each.payload for each in offered}
     assert latest.pop("fleet/r2/events/0") == b"newer"
     wanted = {f"fleet/{topic}": topic.encode() for topic in topics | {"r2/map"}}
@@ -219,6 +221,106 @@ def test_the_publisher_waits_for_the_commit(rig: Rig) -> None:
     assert not peer.received()
     store.commit()
     assert isinstance(peer.only(Puback), Puback)
+
+
+@pytest.mark.parametrize("version", [V311, V5])
+def test_publishers_wait_while_the_disk_is_behind(rig: Rig, version: int) -> None:
+    """Nobody else does, and what waits is acknowledged when it is stored."""
+    store = rig.store
+    assert isinstance(store, FakeStore)
+    rig.begin()
+    rig.backlog.staged = store._stage
+    flood, other = Peer(rig.broker, version), rig.join("other")
+    flood.connect("flood", user="user")
+    rig.backlog.is_behind_disk = store.holding = True
+    for number in range(1, 4):
+        flood.send(Publish("r2/events/x", b"%d" % number, 1, packet_id=number))
+    flood.send(Publish("r2/events/x", b"4", 2, packet_id=4))
+    assert rig.backlog.taken() == [("fleet/r2/events/x", b"1")]  # which showed that it is behind
+    flood.send(Pingreq())  # which is read nevertheless
+    assert other.publish("r2/else", b"x", 1) in (0, ReasonCode.NO_MATCHING_SUBSCRIBERS)
+    assert other.publish("r2/events/x", b"other", 0) == 0
+    assert rig.backlog.taken() == [("fleet/r2/events/x", b"other")]
+    inside = rig.broker.attach("_bridge", InsideLink())
+    rig.broker.publish(Message("r2/events/x", b"ROS", 1), inside)
+    assert [(each.is_acknowledged, each.user) for each in rig.backlog.offers] == [(False, None)]
+    store.commit()  # too little was written: each commit lets one pass, to see how it is now
+    store.holding = True
+    rig.backlog.taken()
+    flood.go_on()
+    assert rig.backlog.taken() == [("fleet/r2/events/x", b"2")]
+    puback, pingresp = flood.received()
+    assert isinstance(puback, Puback) and puback.packet_id == 1
+    assert isinstance(pingresp, Pingresp)
+    rig.backlog.is_behind_disk = False
+    store.commit()
+    flood.go_on()
+    assert [payload for _, payload in rig.backlog.taken()] == [b"3"]
+    answers = flood.received()
+    assert [(type(each), each.packet_id) for each in answers] == [
+        (Puback, 2),
+        (Puback, 3),
+        (Pubrec, 4),
+    ]
+    assert not rig.broker.accounting.congested
+
+
+def test_who_waits_for_a_disk_that_fails_is_refused(rig: Rig) -> None:
+    store = rig.store
+    assert isinstance(store, FakeStore)
+    rig.begin()
+    rig.backlog.staged = store._stage
+    peers = [Peer(rig.broker, version) for version in (V311, V5)]
+    for number, peer in enumerate(peers):
+        peer.connect(f"peer {number}", user="user")
+    rig.backlog.is_behind_disk = True
+    assert peers[1].publish("r2/events/x", b"1", 1) == 0
+    for peer in peers:
+        peer.send(Publish("r2/events/x", b"2", 1, packet_id=7))
+    rig.backlog.is_behind_disk = False
+    rig.backlog.is_full = True  # as it is then
+    store.commit(kept=False)
+    for peer in peers:
+        peer.go_on()
+    assert peers[0].transport.closed and not peers[0].received()
+    assert peers[1].only(Puback).reason_code == ReasonCode.QUOTA_EXCEEDED
+    assert [payload for _, payload in rig.backlog.taken()] == [b"1"]
+
+
+def test_what_a_client_leaves_behind_while_the_disk_is_behind_is_not_taken(rig: Rig) -> None:
+    """It was not acknowledged. A flood of clients that come and go takes no memory."""
+    rig.begin()
+    peer = rig.join()
+    rig.backlog.is_behind_disk = True
+    for number in range(3):
+        peer.send(Publish("r2/events/x", b"%d" % number, 1, packet_id=1 + number))
+    peer.client.hurry()
+    peer.client.lost()
+    rig.broker.flush()
+    assert [payload for _, payload in rig.backlog.taken()] == [b"0"]
+    assert rig.broker.counters.publish_dropped == 2
+    assert not rig.broker.disk._waiting
+
+
+def test_what_comes_from_one_fleet_waits_for_the_disk_of_another_link(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.begin()
+    fleet = rig.connect()
+    name = "_upstream.other"
+    other = rig.broker.attach(name, OtherLink(), Identity("upstream", name))
+    rig.broker.subscribe(other, Subscription("r2/mission/#", 0))
+    rig.broker.disk.begin()
+    assert fleet.send("fleet/r2/mission/1") == -1 and not rig.counters.delivered
+    rig.store._tell(True)  # type: ignore[attr-defined]
+    fleet.turn()
+    assert fleet.connection.codes() == [(1, 0)] and rig.counters.delivered == 1
+
+
+class OtherLink(InsideLink):
+    """The link of another link's session, while the disk is behind."""
+
+    def must_wait(self, message: Message, client_id: str) -> bool:
+        return client_id == "_upstream_in.fleet"
 
 
 def test_an_expired_message_is_not_offered(rig: Rig) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -62,3 +63,14 @@ def test_fast_and_slow_are_the_same(
     if published_at is not None:
         again = PROPERTIES.encode(published, expiry, number, published_at + 0.25)
         assert again == slow(published, expiry, number, published_at + 0.25)
+
+
+@pytest.mark.parametrize("start", [-4.653, 0.0, 1_700_000_000.0, 1_699_999_999.999])
+@pytest.mark.parametrize("step", [1.3e-7, 3.1e-5, 4.9e-4])
+def test_times_that_follow_each_other(start: float, step: float) -> None:
+    properties = PublishProperties()
+    for place in range(1000):
+        published = encode_properties({Property.CONTENT_TYPE: "x"} if place % 100 < 50 else {})
+        expiry = 7 if place % 10 == 9 else None
+        at = start - 3.01e-5 + place * step
+        assert properties.encode(published, expiry, None, at) == slow(published, expiry, None, at)

@@ -14,6 +14,7 @@ from waiting import until
 from appliance import config
 from appliance.app.reload import ReloadError
 from appliance.mqtt.packets import Publish
+from appliance.upstream.backlog import Backlog
 from appliance.upstream.status import warnings_of
 from appliance.upstream.uplink import Uplink
 from upstream.fake_fleet import FakeFleet
@@ -70,6 +71,38 @@ async def test_links_are_reloaded(tmp_path: Path) -> None:
             assert retained.get("r2d2/_appliance/upstream/second") is not None
 
 
+async def test_what_is_said_of_a_link_ends_when_it_is_removed_before_a_start(
+    tmp_path: Path,
+) -> None:
+    async with FakeFleet() as fleet:
+        rig = Rig(tmp_path, fleet.port)
+        settings = yaml.safe_load(rig.file.read_text())
+        link = settings["upstreams"][0]
+        settings["upstreams"] += [{**link, "name": "second", "client_id": "second"}]
+        rig.file.write_text(yaml.safe_dump(settings))
+        topic = "r2d2/_appliance/upstream/{}".format
+        async with running(rig):
+            await rig.connected()
+            await publish(rig, "other/_appliance/state", b"of a user", retain=True)
+            assert rig.app.broker.retained.get(topic("second")) is not None
+        settings["upstreams"] = [link]
+        rig.file.write_text(yaml.safe_dump(settings))
+        async with running(rig):
+            retained = rig.app.broker.retained
+            assert retained.get(topic("fleet")) is not None
+            assert retained.get(topic("second")) is None
+        # Nor does a robot of another name say anything.
+        rig.file.write_text(yaml.safe_dump({**settings, "robot": "c3po"}))
+        async with running(rig):
+            retained = rig.app.broker.retained
+            found = sorted(each for each, _ in retained.find("+/_appliance/#"))
+            assert found == [
+                "c3po/_appliance/state",
+                "c3po/_appliance/upstream/fleet",
+                "other/_appliance/state",
+            ]
+
+
 async def test_what_is_published_while_a_link_is_reloaded_is_not_lost(tmp_path: Path) -> None:
     door = "fleet/r2d2/events/door"
     async with FakeFleet() as fleet:
@@ -92,7 +125,10 @@ async def test_what_is_published_while_a_link_is_reloaded_is_not_lost(tmp_path: 
             assert not fleet.faults
 
 
-async def test_what_a_reload_loses_is_counted_and_the_link_before_is_freed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("failing", [False, True])
+async def test_a_reload_loses_what_cannot_be_stored_and_the_link_before_is_freed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: bool
+) -> None:
     async with FakeFleet() as fleet:
         rig = Rig(tmp_path, fleet.port)
         (link,) = yaml.safe_load(rig.file.read_text())["upstreams"]
@@ -109,12 +145,16 @@ async def test_what_a_reload_loses_is_counted_and_the_link_before_is_freed(tmp_p
             try:
                 before = weakref.ref(rig.uplink)
                 answers = rig.uplink._answers
+                if failing:  # as while nothing can be written
+                    monkeypatch.setattr(Backlog, "store", lambda _: None)
                 await reload(rig, {**link, "keep_alive": "20 s"})
                 await until(lambda: before() is None, "the link before to be freed")
             finally:
                 gc.enable()
-            assert rig.status().waiting == 2 and rig.status().forgotten == 3
-            assert any("3" in each for each in warnings_of(rig.status().as_json()))
+            assert rig.status().waiting == (2 if failing else 5)
+            assert rig.status().forgotten == (3 if failing else 0)
+            told = any("lost" in each for each in warnings_of(rig.status().as_json()))
+            assert told is failing
             assert rig.uplink._answers is answers
             state = "$SYS/broker/connection/{}/state".format
             assert rig.app.broker.retained.get(state("r2d2")) is not None

@@ -76,7 +76,7 @@ def test_a_rule_with_qos_0_is_sent_with_qos_0(keep: KeepRule, restarted: bool, h
     assert link.offer("2", "event") is None
     if held and keep != "latest":
         for entry in link.take():
-            assert link.backlog.hold(entry, 10)
+            assert link.backlog.hold(entry, 10, link.backlogs.time)
         link.backlog.rewind()
         link.backlog.connected()
     link.backlogs.commit()
@@ -111,9 +111,9 @@ def test_what_is_too_large_is_not_written_anew_with_each_limit_that_is_a_byte_mo
     held: list[str] = []
     hold = backlog.hold
 
-    def noted(entry: Entry, packet_size: int) -> bool:
+    def noted(entry: Entry, packet_size: int, now: float) -> bool:
         held.append(entry.record.topic)
-        return hold(entry, packet_size)
+        return hold(entry, packet_size, now)
 
     backlog.hold = noted  # type: ignore[method-assign]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from waiting import until
 
-from appliance.mqtt.packets import Subscribe
+from appliance.mqtt.packets import Disconnect, Publish, Subscribe
+from appliance.mqtt.reason import ReasonCode
 from appliance.upstream import unanswered as unanswered_module
 from appliance.upstream import uplink
 from appliance.upstream.status import warnings_of
@@ -18,7 +19,7 @@ from appliance.upstream.unanswered import (
     LONGEST_LEFT_OUT,
     UnansweredFilters,
 )
-from upstream.fake_fleet import FakeFleet, Visit
+from upstream.fake_fleet import FakeFleet, Visit, accept, refuse
 from upstream.uplink_rig import Rig, hurry, running
 from upstream.uplink_rig import event_loop_policy as event_loop_policy
 
@@ -105,8 +106,9 @@ def test_a_filter_is_left_out_for_longer_each_time() -> None:
     assert times == [1, 2, 4, 8, 16, 24, LONGEST_LEFT_OUT / LEFT_OUT_FOR]
 
 
+@pytest.mark.parametrize("how", ["closes", "disconnects"])
 async def test_a_link_works_without_a_filter_and_asks_for_it_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     hurry(monkeypatch)
     monkeypatch.setattr(uplink, "TICK", 0.05)
@@ -119,7 +121,7 @@ async def test_a_link_works_without_a_filter_and_asks_for_it_again(
 
         def grant(visit: Visit, packet: Subscribe) -> None:
             if secret in (each.filter for each in packet.subscriptions) and not is_allowed:
-                visit.close()
+                (_disconnect if how == "disconnects" else Visit.close)(visit)
             else:
                 fleet.good_grant(visit, packet)
 
@@ -139,6 +141,78 @@ async def test_a_link_works_without_a_filter_and_asks_for_it_again(
             states = [each.payload for each in visit.published if "state" in each.topic]
             assert states == [b"online"]  # not said again
             assert not list(warnings_of(rig.status().as_json()))
+
+
+def _disconnect(visit: Visit) -> None:
+    visit.send(Disconnect(ReasonCode.NOT_AUTHORIZED))
+    visit.close()
+
+
+@pytest.mark.parametrize("how", ["closes", "disconnects", "answers and closes"])
+async def test_a_link_works_without_a_state_that_the_fleet_does_not_take_and_says_it_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, how: str
+) -> None:
+    hurry(monkeypatch)
+    monkeypatch.setattr(uplink, "TICK", 0.05)
+    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 2.0)
+    state, door = "fleet/r2d2/_appliance/state", "fleet/r2d2/events/door"
+    async with FakeFleet() as fleet:
+        is_allowed = False
+
+        def acknowledge(visit: Visit, packet: Publish) -> None:
+            if packet.topic != state or is_allowed:
+                accept(visit, packet)
+            elif how == "disconnects":
+                _disconnect(visit)
+            else:
+                if how == "answers and closes":
+                    refuse(ReasonCode.NOT_AUTHORIZED)(visit, packet)
+                visit.close()
+
+        fleet.acknowledge = acknowledge
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await until(lambda: "ends the connection upon" in (rig.status().state_refusal or ""))
+            publisher = await rig.client("publisher")
+            await publisher.send(Publish("r2d2/events/door", b"x", 1, packet_id=1))
+            await until(lambda: door in fleet.topics)
+            await rig.drained()
+            visit, closes = fleet.visit, len(fleet.visits)
+            assert rig.status().connected and rig.status().problem is None
+            (told,) = warnings_of(rig.status().as_json())
+            assert "the fleet does not see that the robot is online" in told
+            assert caplog.text.count("ends the connection upon") == 1
+            assert closes < 9
+            is_allowed = True
+            await until(lambda: rig.status().state_refusal is None)
+            assert fleet.visit is visit
+            states = [each.payload for each in visit.published if each.topic == state]
+            assert states == [b"online"]
+            publisher.hang_up()
+        assert fleet.published[-1].payload == b"offline"
+
+
+async def test_closes_behind_a_state_that_the_fleet_takes_leave_nothing_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a broker that restarts again and again."""
+    hurry(monkeypatch)
+    monkeypatch.setattr(uplink, "TICK", 0.05)
+    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    state = "fleet/r2d2/_appliance/state"
+    async with FakeFleet() as fleet:
+
+        def acknowledge(visit: Visit, packet: Publish) -> None:
+            if fleet.topics.count(state) <= 3:
+                visit.close()
+            else:
+                accept(visit, packet)
+
+        fleet.acknowledge = acknowledge
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            await until(lambda: fleet.topics.count(state) == 4)
+            await until(lambda: rig.uplink._state.is_settled and rig.status().connected)
+            assert rig.status().state_refusal is None and len(fleet.visits) == 4
 
 
 async def test_closes_between_connack_and_suback_leave_no_command_out(

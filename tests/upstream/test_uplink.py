@@ -5,12 +5,16 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from harness import Peer
 from waiting import until
 
+from appliance.broker.link import InsideLink
+from appliance.broker.message import Message
 from appliance.mqtt.codec import V311, Property
 from appliance.mqtt.packets import (
     Connack,
@@ -23,6 +27,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream import channel as channel_module
+from appliance.upstream import disk_room
 from appliance.upstream.refusals import reason_words
 from appliance.upstream.sender import WITHOUT_PROGRESS
 from appliance.upstream.status import warnings_of
@@ -71,12 +76,18 @@ async def test_what_waits_survives_restarts_of_both(tmp_path: Path) -> None:
         for part in (sent[:200], sent[200:]):
             async with running(Rig(tmp_path, fleet.port)) as rig:
                 await publish(rig, "r2d2/events/door", *part)
+                if part[0] == b"0":  # in memory
+                    peer = await rig.client("state")
+                    await peer.send(Publish("r2d2/state/battery", b"99", 0))
+                    await until(lambda: rig.status().waiting == 201)
+                    peer.hang_up()
                 assert rig.status().problem and not rig.status().connected
         await fleet.start()
         async with running(Rig(tmp_path, fleet.port)) as rig:
             await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 500)
             await rig.drained()
     assert payloads(fleet, "fleet/r2d2/events/door") == sent
+    assert payloads(fleet, "fleet/r2d2/state/battery") == [b"99"]
 
 
 async def test_what_is_not_acknowledged_there_is_sent_again_on_the_next_connection(
@@ -418,6 +429,55 @@ async def test_a_full_backlog_says_no_where_it_should(tmp_path: Path) -> None:
             await fleet.start()
             await rig.drained()
             assert len(payloads(fleet, "fleet/r2d2/events/door")) == taken
+
+
+async def test_while_the_disk_stands_still_memory_is_bounded_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client does not wait for PUBACK, and a node of ROS publishes as well."""
+    limit, size, count = 400_000, 10_000, 300
+    monkeypatch.setattr(disk_room, "UNWRITTEN_FROM_ROS", (limit // 2,) * 3)
+    monkeypatch.setattr(disk_room, "UNWRITTEN_AWAITED", (limit,) * 3)
+    topic, from_ros = "r2d2/events/door", "r2d2/events/ros"
+    is_released = threading.Event()
+    async with FakeFleet() as fleet:
+        await fleet.stop()
+        async with running(Rig(tmp_path, fleet.port)) as rig:
+            broker = rig.app.broker
+            store: Any = broker.store
+            writer = store._committer._writer
+            write = writer._write
+            monkeypatch.setattr(writer, "_write", lambda b: (is_released.wait(), write(b)))
+            flood, other = await rig.client("flood"), await rig.client("other")
+            sending = asyncio.ensure_future(
+                flood.send(
+                    *(
+                        Publish(topic, b"%d" % number + bytes(size), 1, False, False, number)
+                        for number in range(1, count + 1)
+                    )
+                )
+            )
+            try:
+                await until(lambda: broker.disk._waiting, "the publisher to wait")
+                node = broker.attach("_node", InsideLink())
+                broker.publish(Message(from_ros, b"x", 1), node)
+                await other.send(Publish("r2d2/local", b"x", 1, packet_id=1))
+                assert isinstance(await other.receive(), Puback)  # nobody else waits
+                assert limit <= store.backlogs.unwritten < limit + 2 * size
+                assert rig.status().waiting < limit // size + 2
+            finally:
+                is_released.set()
+            await sending
+            answers = [await flood.receive() for _ in range(count)]
+            assert [(each.packet_id, each.reason_code) for each in answers] == [
+                (number, 0) for number in range(1, count + 1)
+            ]
+            await fleet.start()
+            await rig.drained()
+            numbers = [int(each[:-size]) for each in payloads(fleet, f"fleet/{topic}")]
+            assert numbers == list(range(1, count + 1))
+            assert not payloads(fleet, f"fleet/{from_ros}")  # nobody was acknowledged for it
+            assert rig.status().dropped == {"r2d2/events/#": {"disk": 1}}
 
 
 async def _work(peer: Peer, is_over: asyncio.Event) -> None:
