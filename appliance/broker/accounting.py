@@ -13,6 +13,10 @@ from appliance.broker.limits import Limits
 from appliance.broker.message import Message
 from appliance.broker.store import Store
 
+#: The most bytes of the topics that a session's rates know: 12,000 topics or so. To forget them all
+#: at once takes some three milliseconds.
+TOPICS_OF_A_SESSION = 4 * 1024 * 1024
+
 
 class CongestedReader(Protocol):
     """A connected receiver that publishers may wait for, see `backpressure`: its session."""
@@ -38,12 +42,16 @@ class Accounting:
     queued_bytes: int = 0
     #: The part of these that is unprocessed input: partial packets, and topic aliases.
     input_bytes: int = 0
-    #: Connected receivers whose queues are more than half full and that publishers may wait for.
-    congested: dict[CongestedReader, None] = field(default_factory=dict)
+    #: Whom publishers may have to wait for: connected receivers whose queues are more than half
+    #: full (`CongestedReader`), and the disk (`DiskCongestion`).
+    congested: dict[object, None] = field(default_factory=dict)
     #: The limits that every message is checked against, copied from `limits` for speed.
     queue_bytes: int = field(init=False)
     half_queue: int = field(init=False)
     memory: int = field(init=False)
+    #: Bytes of the topics that the rates of a session's subscriptions may know, and a user's.
+    session_topics: int = field(init=False)
+    user_topics: int = field(init=False)
     #: Below this use, in bytes, no quota of a user can be exceeded, so that none is looked up.
     unrestricted_memory: int = field(init=False)
     #: What each user may hold.
@@ -69,6 +77,9 @@ class Accounting:
         self.memory = limits.memory * 7 // 8
         self.reserve = limits.memory // 8 // limits.connections
         self.quotas = Quotas(limits, self.memory, self.store.size)
+        # The larger part of what a user is sure of is for what waits.
+        self.session_topics = min(limits.queue_bytes // 4, TOPICS_OF_A_SESSION)
+        self.user_topics = self.quotas.memory.sure // 4
         self.unrestricted_memory = min(self.quotas.memory.lent, self.quotas.memory.most)
 
     def fits(self, account: Account, size: int) -> bool:

@@ -32,7 +32,11 @@ class AccountedSession(Protocol):
 
     @property
     def bytes(self) -> int:
-        """Its share of `Account.bytes`."""
+        """Its share of `Account.bytes`, without `topic_bytes`."""
+
+    @property
+    def topic_bytes(self) -> int:
+        """Its share of `Account.topic_bytes`."""
 
     def close_link(self, reason: ReasonCode, message: str) -> None:
         """End its connection, if it has one."""
@@ -50,6 +54,7 @@ class Account:
         "retained",
         "retained_bytes",
         "stored",
+        "topic_bytes",
         "username",
     )
 
@@ -63,6 +68,8 @@ class Account:
         #: Its share of `Accounting.queued_bytes`, and the part of that in output buffers.
         self.bytes = 0
         self.output = 0
+        #: The part of `bytes` that are topics which the rates of subscriptions know.
+        self.topic_bytes = 0
         #: Retained messages that it was the last to publish, and their bytes.
         self.retained = 0
         self.retained_bytes = 0
@@ -224,9 +231,11 @@ class Accounts:
         """Move a session to the account of its user."""
         was_present = session in session.account.present
         self.ended(session)
-        session.account.bytes -= session.bytes
+        session.account.bytes -= session.bytes + session.topic_bytes
+        session.account.topic_bytes -= session.topic_bytes
         session.account = account
-        account.bytes += session.bytes
+        account.bytes += session.bytes + session.topic_bytes
+        account.topic_bytes += session.topic_bytes
         if was_present:
             self.came(session)
         else:

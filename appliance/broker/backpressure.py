@@ -18,6 +18,8 @@ wait is limited by these rules; after it `queue_full` decides.
 * Nothing else waits: neither other publishers, nor the publisher's earlier QoS 0 messages, nor its
   acknowledgements, so that two clients that publish to each other drain each other's queues.
 
+Publishers of what a link to another broker keeps wait for the disk as well, see `DiskCongestion`.
+
 Messages of the appliance itself (the bridge, wills, plugins) never wait.
 """
 
@@ -35,6 +37,9 @@ PATIENCE = 0.25
 #: that each of its messages adds to its allowance.
 PUBLISHER_PATIENCE = 1.0
 MESSAGE_PATIENCE = 0.01
+
+#: Seconds after which a publisher that waits for the disk tries again though nobody has woken it.
+LOOK_AGAIN = 1.0
 
 #: The share that counts of the time in which a publisher waited for the computer: it limits the
 #: wait for readers that are never found to be at fault.
@@ -262,3 +267,40 @@ class Congestion:
         """The queue is empty, or its reader disconnected: publishers no longer wait for it."""
         self._accounting.congested.pop(self._reader, None)
         self.wake()
+
+
+class DiskCongestion:
+    """More waits to be written for links to other brokers than may be in memory.
+
+    A QoS 1 or 2 message for them waits, and so do later packets of its publisher, for as long as
+    the disk takes. No patience ends that: a message is not acknowledged before it is stored, so
+    that its publisher waits for the disk in any case.
+    """
+
+    __slots__ = ("_accounting", "_waiting")
+
+    def __init__(self, accounting: Accounting) -> None:
+        self._accounting = accounting
+        #: The waiting publishers, in their order of arrival.
+        self._waiting: dict[Waiting, None] = {}
+
+    def begin(self) -> None:
+        """Ask about messages from now on, until the next commit."""
+        self._accounting.congested[self] = None
+
+    def wait(self, publisher: Waiting) -> float:
+        """Add a waiting publisher; returns the seconds after which it tries again anyway."""
+        self._waiting[publisher] = None
+        return LOOK_AGAIN
+
+    def forget(self, publisher: Waiting) -> None:
+        """Remove a publisher that does not wait any more."""
+        self._waiting.pop(publisher, None)
+
+    def wake(self) -> None:
+        """Something was written, or cannot be: let the waiting publishers try, in their order."""
+        self._accounting.congested.pop(self, None)
+        while self._waiting:
+            publisher = next(iter(self._waiting))
+            del self._waiting[publisher]
+            publisher.proceed()

@@ -16,7 +16,7 @@ from datetime import timedelta
 from typing import Protocol, TypeAlias
 
 from appliance.broker.accounts import Account, AccountedSession
-from appliance.broker.backpressure import Congestion
+from appliance.broker.backpressure import Congestion, DiskCongestion
 from appliance.broker.delivery import Delivery, PendingWill, UnreleasedPublish
 from appliance.broker.faults import Faults
 from appliance.broker.limits import Features, Limits
@@ -128,6 +128,8 @@ class Broker:
         self.faults = Faults(self.rate_limited_log)
         self.accounting = SessionAccounting(self.limits, store, faults=self.faults)
         self.counters = self.accounting.counters
+        self.disk = DiskCongestion(self.accounting)
+        self.rates = self.accounting.rates
         self.sessions: dict[str, Session] = {}
         self.router = Router(access, self.accounting, self.sessions)
         self.accounting.may_still_receive = self.router.may_still_receive
@@ -420,6 +422,12 @@ class Broker:
             self._publish_will(session)
         faults.run("disconnect.store", self.store.session_saved, session, otherwise=None)
 
+    def delete(self, session: Session, why: str) -> None:
+        """End a client's session, with its connection if it has one; its will is published."""
+        session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, why)
+        if self.sessions.get(session.client_id) is session:  # it outlives its connection
+            self._end(session)
+
     def _log_queue_full(self, session: Session, shortage: str) -> None:
         if session.ends_at is None:  # it is back, or has ended
             return
@@ -616,8 +624,10 @@ class Broker:
         if self.observer is not None:
             self.observer.published(origin, message)
         retain = message.retain
+        # A call of the appliance is not retained: there may be a password in it.
+        is_kept = retain and (origin.identity is None or route.topic[0] != "$")
         # If there is no room to retain it, connected subscribers still get it.
-        is_accepted = not retain or self.retained.keep(message, self._owner(origin), refusable)
+        is_accepted = not is_kept or self.retained.keep(message, self._owner(origin), refusable)
         published_qos = message.qos
         self.counters.cost += 1 + len(targets)
         taken = full = False
@@ -655,6 +665,8 @@ class Broker:
                     else:
                         self._log_receiver_full(asked, message)
                     full = True
+            if route.rated and self._offer(route, message):
+                taken = True
         finally:
             message.publisher = None
         if not is_accepted or (full and not taken):
@@ -664,6 +676,19 @@ class Broker:
         # 0x10 means that the topic has no subscription. The publisher does not learn that a
         # subscriber is absent or may not read the topic.
         return ReasonCode.SUCCESS if route.subscribed else ReasonCode.NO_MATCHING_SUBSCRIBERS
+
+    def _offer(self, route: Fanout, message: Message) -> bool:
+        """Offer the message to receivers that have asked for a rate; True if any will have it."""
+        taken = False
+        now = self.rates.clock()
+        self.counters.cost += len(route.rated)
+        for limit, as_published, subscription_ids in route.rated:
+            retain = message.retain and as_published
+            try:
+                taken |= limit.offer(message, retain, subscription_ids, now)
+            except Exception as error:
+                self._not_delivered(limit.session, error)
+        return taken
 
     def _owner(self, origin: Session) -> Account:
         """The account that what the session retains is counted for."""
@@ -682,7 +707,7 @@ class Broker:
         except Exception as error:
             return self._not_delivered(session, error)
 
-    def _not_delivered(self, session: Session, error: Exception) -> bool:
+    def _not_delivered(self, session: object, error: Exception) -> bool:
         self.counters.publish_dropped += 1
         self.faults.caught("broker.delivery", error, session)
         return False
@@ -733,6 +758,7 @@ class Broker:
                 full.add(share)
             is_taken |= bool(asked) and share not in full
             is_taken |= any(not qos and session.link is not None for session, qos, _, _ in members)
+        is_taken |= any(limit.session.link is not None for limit, _, _ in route.rated)
         return frozenset(full), bool(full) and not is_taken
 
     def congestions(self, route: Fanout, message: Message) -> list[Congestion]:
@@ -760,9 +786,31 @@ class Broker:
         congestions = [session.congestion for session in full]
         return [each for each in congestions if each is not None and each.patience()]
 
+    def must_wait_for_disk(self, route: Fanout, message: Message, origin: Session) -> bool:
+        """Whether a QoS 1 or 2 message has to wait until more of what is stored is written.
+
+        A publisher that waits is given to `disk`.
+        """
+        if self.disk not in self.accounting.congested:
+            return False
+        self._count_checks(route)
+        for session, _, _, _ in route.targets:
+            link = session.link
+            if isinstance(link, InsideLink) and link.must_wait(message, origin.client_id):
+                self.rate_limited_log.warning(
+                    self.now,
+                    "disk",
+                    "%s waits: more comes for %s than the disk takes",
+                    origin,
+                    session,
+                )
+                return True
+        return False
+
     def _count_checks(self, route: Fanout) -> None:
         """Add the cost of checking each receiver of a route."""
         checks = len(route.targets) + sum(len(members) for _, members in route.shares)
+        checks += len(route.rated)
         self.counters.cost += checks // CHECKS_PER_COST_UNIT
 
     def must_store(self, route: Fanout, message: Message, origin: Session) -> bool:
@@ -941,6 +989,10 @@ class Broker:
             else:
                 subscription = session.subscriptions[topic_filter]
                 ids = [subscription.identifier] if subscription.identifier else None
+                limit = session.rate_limits.get(topic_filter)
+                if limit is not None and not limit.offer_retained(message, ids, self.rates.clock()):
+                    yield None
+                    continue
                 yield Delivery(message, min(message.qos, subscription.qos), True, ids, None)
 
     def unsubscribe(self, session: Session, topic_filter: str) -> ReasonCode:
@@ -1018,6 +1070,29 @@ class Broker:
         if expires_more:
             return now
         return self._deadlines[0][0] if self._deadlines else math.inf
+
+    def send_due(self) -> float:
+        """Send what has waited for its turn because of a subscription's max-rate.
+
+        Returns when to call this again, infinity for never; `RateSchedule.wake` says when earlier.
+        When more is due than the cost limit of a tick allows, that is at once.
+        """
+        rates = self.rates
+        now = rates.clock()
+        self.accounting.now = max(now, self.now)
+        end = self.counters.cost + COST_PER_TICK
+        rates.sending(True)
+        try:
+            while self.counters.cost <= end:
+                limit = rates.next_due(now)
+                if limit is None:
+                    break
+                self.faults.run("clock.rate", limit.send_due, now, end, otherwise=None)
+                limit.go_on(now)
+        finally:
+            rates.sending(False)
+            self.flush()
+        return rates.next_at
 
     def _fall_due(self, session: Session, now: float) -> None:
         """Publish an absent client's will, and end its session, if these are due."""
@@ -1114,6 +1189,7 @@ class Broker:
                     session.hold_back()
             for output in waiting:
                 faults.run("commit.abandon", output.abandon, otherwise=None)
+        faults.run("commit.wake", self.disk.wake, otherwise=None)
         if self._waiting:
             self.faults.run("commit.hurry", self.store.hurry, otherwise=None)
         self.flush()

@@ -27,12 +27,19 @@ from appliance.broker.handshake import (
 )
 from appliance.broker.inflow import Inflow
 from appliance.broker.message import OVERHEAD, DelayedMessage, Message
-from appliance.broker.output import CANNOT_KEEP, Output, in_words
+from appliance.broker.output import CANNOT_KEEP, LONGEST_REASON, Output, in_words
 from appliance.broker.ports import Exchange, Transport
 from appliance.broker.routing import Fanout
 from appliance.broker.session import Session
 from appliance.broker.subscribing import AwaitingDecision, Step, answers, subscribe, unsubscribe
-from appliance.broker.values import INSIDE, AccessQuery, Identity, Refusal
+from appliance.broker.values import (
+    INSIDE,
+    WRONG_LOGIN,
+    AccessQuery,
+    Identity,
+    PublishRejection,
+    Refusal,
+)
 from appliance.mqtt.codec import (
     V5,
     V31,
@@ -99,6 +106,11 @@ def _size(arrived: Arrived) -> int:
     if isinstance(arrived, Publish):
         return text_size(arrived.topic) + len(arrived.payload) + len(arrived.passed_on) + OVERHEAD
     return OVERHEAD
+
+
+def _guarded(route: Fanout) -> PublishRejection:
+    """Why a guard of the topic, such as a lease on ROS, refuses what the access rules allow."""
+    return PublishRejection(ReasonCode.NOT_AUTHORIZED, route.reason[:LONGEST_REASON])
 
 
 #: CONNACK codes that may have a reason string: they do not reveal which users exist.
@@ -307,7 +319,7 @@ class ClientHandler:
                 or target[0].link is None
                 or not target[0].link.mirror(head, self._version, len(payload))
             ]
-            if not targets and not route.shares:
+            if not targets and route.is_plain:
                 return
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
@@ -325,12 +337,7 @@ class ClientHandler:
             return
         code = self.broker.publish_to(targets, route, message, session)
         if qos:
-            if message.rejection is not None:
-                rejection, message.rejection = message.rejection, None
-                self.output.reject_publish(0x40, packet_id, rejection)
-                return
-            reason = self._reason(code, route, message) if code >= 0x80 else ""
-            self.output.acknowledge(0x40, packet_id, code, reason)
+            self._answer(packet_id, code, route, message)
 
     def _on_publish(self, packet: Publish) -> None:
         """Process a PUBLISH from the full decoder; most likely it has properties."""
@@ -370,12 +377,19 @@ class ClientHandler:
                 self.output.acknowledge(0x40, packet_id, ReasonCode.SUCCESS)
         else:
             code = broker.publish_to(route.targets, route, message, session)
-            if packet.qos and message.rejection is not None:
-                rejection, message.rejection = message.rejection, None
-                self.output.reject_publish(0x40, packet_id, rejection)
-            elif packet.qos:
-                reason = self._reason(code, route, message) if code >= 0x80 else ""
-                self.output.acknowledge(0x40, packet_id, code, reason)
+            if packet.qos:
+                self._answer(packet_id, code, route, message)
+
+    def _answer(self, packet_id: int, code: int, route: Fanout, message: Message) -> None:
+        """Acknowledge a message of QoS 1 that was published, or refused."""
+        if message.rejection is not None:
+            rejection, message.rejection = message.rejection, None
+            self.output.reject_publish(0x40, packet_id, rejection)
+        elif route.is_guarded:
+            self.output.reject_publish(0x40, packet_id, _guarded(route))
+        else:
+            reason = self._reason(code, route, message) if code >= 0x80 else ""
+            self.output.acknowledge(0x40, packet_id, code, reason)
 
     def _reason(self, code: int, route: Fanout, message: Message) -> str:
         """Why a message was refused, as a text; empty if the client gets no reason strings."""
@@ -465,14 +479,22 @@ class ClientHandler:
     # --- backpressure, see backpressure.py -----------------------------------------------------
 
     def _must_wait(self, arrived: Arrived, message: Message, route: Fanout) -> bool:
-        """Let the message wait if receivers have no room for it now, but soon will."""
-        congestions = self.broker.congestions(route, message) if route.allowed else []
+        """Let the message wait if receivers have no room for it now, but soon will, or if the disk
+        is behind."""
+        broker, session, now = self.broker, self.session, self._accounting.now
+        assert session is not None
+        congestions = broker.congestions(route, message) if route.allowed else []
         allowance = self._allowance
-        if not congestions or allowance.used_up or self._hurries:
+        if congestions and not allowance.used_up and not self._hurries:
+            self.transport.wait(max(allowance.wait(self, congestions, now), RECHECK))
+        else:
             allowance.end_wait(self)
-            return False
-        now = self._accounting.now
-        self.transport.wait(max(allowance.wait(self, congestions, now), RECHECK))
+            if not route.allowed or not broker.must_wait_for_disk(route, message, session):
+                return False
+            if self._hurries:  # its client has left, and was not told that it had come
+                self._counters.publish_dropped += 1
+                return True
+            self.transport.wait(broker.disk.wait(self))
         # It is counted when it is processed again.
         self._counters.publish_received -= 1
         self._counters.publish_bytes_received -= len(message.payload)
@@ -607,6 +629,10 @@ class ClientHandler:
         elif not route.allowed:
             self.broker.refuse_publish(session, route, message)
             # 3.1.1 cannot refuse: the exchange continues, and the message is not delivered.
+            if route.is_guarded and self._version == 5:
+                self._note_refused(packet_id)
+                self.output.reject_publish(0x50, packet_id, _guarded(route))
+                return
             code = ReasonCode.NOT_AUTHORIZED
         elif self._version == 5 and len(session.received) >= self._unfinished_maximum:
             raise ProtocolError(  # [MQTT-3.3.4-7]
@@ -715,8 +741,16 @@ class ClientHandler:
         if isinstance(packet, Pingreq):
             self._send(Pingresp())  # [MQTT-3.12.4-1]
         elif isinstance(packet, Subscribe) and session is not None:
-            explains = self.output.explains
-            self._begin(subscribe(self.broker, session, packet, self._wake, explains=explains))
+            self._begin(
+                subscribe(
+                    self.broker,
+                    session,
+                    packet,
+                    self._wake,
+                    explains=self.output.explains,
+                    may_explain=self.output.may_explain,
+                )
+            )
         elif isinstance(packet, Unsubscribe) and session is not None:
             self._begin(unsubscribe(self.broker, session, packet))
         elif isinstance(packet, Disconnect):
@@ -885,7 +919,8 @@ class ClientHandler:
         if self.broker.audit_log is not None:
             address, tls_info = self.transport.address, self.transport.tls_info()
             self.broker.audit_log.refused(address, reason, code, name, user, tls_info)
-        self._counters.connects_refused += 1
+        self._counters.refuse(code)
+        self._counters.logins_failed += code in WRONG_LOGIN
         explains = code in _EXPLAINED and self.broker.features.reason_strings
         words = in_words(reason) if explains else None
         self._send(Connack(False, code, words))  # [MQTT-3.2.2-6], v3.1.1 [MQTT-3.2.2-4]
@@ -1139,6 +1174,7 @@ class ClientHandler:
             self._held = 0
             self.broker.clients.discard(self)
             self._allowance.stop_waiting(self)
+            self.broker.disk.forget(self)
             self._behind.clear()
             self._behind_size = 0
             self.protocol.close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 #: The cost that one client may cause in one turn of the event loop, see `Counters.cost`: some
 #: milliseconds of work.
@@ -20,11 +20,16 @@ class Counters:
     publish_received: int = 0
     publish_sent: int = 0
     publish_dropped: int = 0
+    #: Messages that a newer one replaced because of a subscription's max-rate.
+    publish_throttled: int = 0
     publish_refused: int = 0
     publish_bytes_received: int = 0
     publish_bytes_sent: int = 0
     connects: int = 0
-    connects_refused: int = 0
+    #: By reason code; `logins_failed` are those of a wrong password or no right to come in, over
+    #: HTTP too.
+    refusals: dict[int, int] = field(default_factory=dict)
+    logins_failed: int = 0
     connections_refused: int = 0
     sockets: int = 0
     #: Work done, in units of about four microseconds: the time that one message takes. Code that
@@ -36,6 +41,15 @@ class Counters:
     #: `Broker._make_room`.
     evicted: int = 0
     clients_maximum: int = 0
+
+    @property
+    def connects_refused(self) -> int:
+        """CONNECT packets that were refused."""
+        return sum(self.refusals.values())
+
+    def refuse(self, code: int) -> None:
+        """Count a CONNECT that is refused with this reason code."""
+        self.refusals[code] = self.refusals.get(code, 0) + 1
 
     @property
     def messages_received(self) -> int:

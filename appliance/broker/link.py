@@ -87,9 +87,16 @@ class InsideLink:
 
     This class drops all messages, which is enough for a session that only publishes. A session that
     subscribes overrides `publish`, and subscribes with QoS 0 and without retained messages.
+
+    One that stores messages calls `DiskCongestion.begin` when many of them are not written yet. It
+    is then asked about each message by `must_wait`.
     """
 
     writable = True
+
+    #: Whether what the session publishes with QoS 1 is acknowledged to somebody, who would send it
+    #: again.
+    acknowledges = False
 
     def publish(
         self,
@@ -128,6 +135,10 @@ class InsideLink:
 
     def close(self, reason: ReasonCode, message: str) -> None:
         """Do nothing: there is no connection."""
+
+    def must_wait(self, message: Message, client_id: str) -> bool:
+        """Whether a QoS 1 or 2 message of that client has to wait for the disk: no."""
+        return False
 
     def rules_changed(self) -> None:
         """The access rules may have changed: subscriptions are neither ended nor granted anew.

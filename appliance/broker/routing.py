@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from appliance.broker.accounting import Accounting
+from appliance.broker.max_rate import RatedTarget, RateLimit
 from appliance.broker.ports import Access, PendingDecisions, PublishGuard
 from appliance.broker.session import Session
 from appliance.broker.shared import Share, Target, as_target
@@ -37,6 +38,7 @@ ROUTE_COST = 20
 VISITED_PER_COST_UNIT = 4
 
 _ALLOWED = Decision(True, "the appliance itself")
+_OF_OTHERS = Decision(False, "calls of the appliance are for itself alone")
 _FAULT = Decision(False, "a fault in the appliance, see its log", pending=True)
 
 
@@ -48,9 +50,15 @@ class Fanout:
     allowed: bool
     #: The rule that allowed or denied it.
     reason: str
+    #: Whether it was a guard that denied it, not an access rule.
+    is_guarded: bool
     targets: list[Target]
     #: Shared subscriptions, each with the members that may receive the topic.
     shares: list[tuple[Share, list[Target]]]
+    #: Receivers that have asked for no more than a rate.
+    rated: list[RatedTarget]
+    #: Whether `targets` are all receivers: there are neither shares nor rates.
+    is_plain: bool
     #: Whether the topic has any subscription, even of a client that may not receive it.
     subscribed: bool
     #: Decisions that are pending; a route with any is not cached.
@@ -74,6 +82,9 @@ class Router:
         self._undecided: list[AccessQuery] | None = None
         #: What topics begin with that only the appliance itself publishes, whatever the rules say.
         self.reserved: tuple[str, ...] = ("$",)
+        #: Topics among these at which clients call the appliance, with a token as one more level or
+        #: without. The access rules decide who may; nobody else receives what is published there.
+        self.calls: frozenset[str] = frozenset()
         #: By topic, the parts of the appliance that restrict who may publish to it.
         self.guards: dict[str, list[PublishGuard]] = {}
         #: Incremented whenever a cached route may be outdated.
@@ -168,17 +179,28 @@ class Router:
 
     def _decide_route(self, session: Session, topic: str, undecided: list[AccessQuery]) -> Fanout:
         decision = self._may_publish(session, topic)
+        is_guarded = False
         if decision and topic in self.guards:
             verdicts = [
                 self._faults.run("broker.guard", guard.decide, session, otherwise=_FAULT)
                 for guard in self.guards[topic]
             ]
             decision = next((verdict for verdict in verdicts if not verdict), decision)
+            is_guarded = not decision
         self._counters.cost += ROUTE_COST
         matches = self._match(topic) if decision else []
-        targets, shares = self._targets(session, topic, matches)
+        targets, shares, rated = self._targets(session, topic, matches)
         return Fanout(
-            topic, decision.allowed, decision.reason, targets, shares, bool(matches), undecided
+            topic,
+            decision.allowed,
+            decision.reason,
+            is_guarded,
+            targets,
+            shares,
+            rated,
+            not shares and not rated,
+            bool(matches),
+            undecided,
         )
 
     def _match(self, topic: str) -> list[tuple[Session, Subscription] | Share]:
@@ -192,13 +214,30 @@ class Router:
         excess = self.excess(topic)
         if excess:  # [MQTT-4.13.1-1]; as mosquitto does
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, f"a topic with {excess}")
-        for beginning in self.reserved:  # [MQTT-4.7.2-1]: for the server's own use
-            if topic.startswith(beginning):
-                return Decision(False, f"topics that begin with {beginning} are the broker's own")
-        return self.decide(session.identity, Action.PUBLISH, topic)
+        return self.may_publish(session.identity, topic)
+
+    def may_publish(self, identity: Identity, topic: str) -> Decision:
+        """Whether the client may publish to the valid topic."""
+        beginning = self.reserved_for(topic)
+        if beginning:  # [MQTT-4.7.2-1]: for the server's own use
+            return Decision(False, f"topics that begin with {beginning} are the broker's own")
+        return self.decide(identity, Action.PUBLISH, topic)
+
+    def reserved_for(self, topic: str) -> str:
+        """What a topic begins with at which no client publishes, whatever the rules say; empty if
+        the rules decide."""
+        for beginning in self.reserved:
+            if topic.startswith(beginning) and not self._is_call(topic):
+                return beginning
+        return ""
+
+    def _is_call(self, topic: str) -> bool:
+        return topic in self.calls or topic.rpartition("/")[0] in self.calls
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """The decision of the access rules; an exception in them denies."""
+        if action is Action.RECEIVE and topic[0] == "$" and self._is_call(topic):
+            return _OF_OTHERS  # there may be a password in it
         decision = self._faults.run(
             "broker.access", self.access.decide, identity, action, topic, otherwise=_FAULT
         )
@@ -219,7 +258,7 @@ class Router:
 
     def _targets(
         self, origin: Session, topic: str, matches: list[tuple[Session, Subscription] | Share]
-    ) -> tuple[list[Target], list[tuple[Share, list[Target]]]]:
+    ) -> tuple[list[Target], list[tuple[Share, list[Target]]], list[RatedTarget]]:
         """One target per session, however many of its subscriptions match [MQTT-3.3.5-1].
 
         Shared subscriptions are separate: a session gets a further copy for each group that chooses
@@ -227,12 +266,16 @@ class Router:
         """
         merged: dict[str, Target] = {}
         shares: list[tuple[Share, list[Target]]] = []
+        rated: list[tuple[Session, Subscription]] = []
         for match in matches:
             if isinstance(match, Share):
                 shares.append((match, self._members(match, topic)))
                 continue
             session, subscription = match
             if subscription.no_local and session is origin:  # [MQTT-3.8.3-3]
+                continue
+            if subscription.max_rate:
+                rated.append((session, subscription))
                 continue
             known = merged.get(session.client_id)
             receiver, qos, as_published, ids = known or (session, 0, False, None)
@@ -244,8 +287,43 @@ class Router:
                 as_published or subscription.retain_as_published,
                 ids,
             )
+        limited = self._rated_targets(topic, rated, merged) if rated else []
         targets = [target for target in merged.values() if self.may_receive(target[0], topic)]
-        return targets, shares
+        return targets, shares, limited
+
+    def _rated_targets(
+        self,
+        topic: str,
+        rated: list[tuple[Session, Subscription]],
+        merged: dict[str, Target],
+    ) -> list[RatedTarget]:
+        """The receivers of subscriptions with a rate, one target per session.
+
+        The highest rate holds for all that match, and none where one of them has none: then the
+        subscription's options are added to the target in `merged`.
+        """
+        found: dict[str, tuple[Session, RateLimit, bool, list[int] | None]] = {}
+        for session, subscription in rated:
+            name = session.client_id
+            limit = session.rate_limits[subscription.filter]
+            as_published = subscription.retain_as_published
+            ids = [subscription.identifier] if subscription.identifier else None
+            if name in merged:
+                receiver, qos, other, more = merged[name]
+                both = [*(more or []), *(ids or [])] or None
+                merged[name] = (receiver, qos, other or as_published, both)
+                continue
+            if name in found:
+                _, best, other, more = found[name]
+                limit = best if best.rate >= limit.rate else limit
+                as_published |= other
+                ids = [*(more or []), *(ids or [])] or None
+            found[name] = (session, limit, as_published, ids)
+        return [
+            (limit, as_published, ids)
+            for session, limit, as_published, ids in found.values()
+            if self.may_receive(session, topic)
+        ]
 
     def _members(self, share: Share, topic: str) -> list[Target]:
         """The members of the group that may receive the topic.
@@ -295,5 +373,7 @@ def _route_size(route: Fanout, topic_wire: bytes) -> int:
     size = ROUTE_SIZE + text_size(route.topic) + len(topic_wire)
     members = [target for _, members in route.shares for target in members]
     for _, _, _, ids in (*route.targets, *members):
+        size += TARGET_SIZE + 8 * len(ids or ())
+    for _, _, ids in route.rated:
         size += TARGET_SIZE + 8 * len(ids or ())
     return size

@@ -13,6 +13,7 @@ from appliance.broker.accounting import Accounting
 from appliance.broker.backpressure import Congestion
 from appliance.broker.delivery import Delivery, Group, PendingWill, UnreleasedPublish, held_size
 from appliance.broker.link import Link
+from appliance.broker.max_rate import RateLimit, RateSchedule
 from appliance.broker.message import Message
 from appliance.broker.values import Identity
 from appliance.mqtt.codec import text_size
@@ -56,6 +57,12 @@ class SessionAccounting(Accounting):
     filled: list[tuple[Session, str]] = field(default_factory=list)
     #: Whether the rules in force still let a session receive a queued message of a topic.
     may_still_receive: Callable[[Session, str], bool] = field(default=lambda session, topic: True)
+    #: When messages are due that wait because of the rate of a subscription.
+    rates: RateSchedule = field(init=False)
+
+    def __post_init__(self) -> None:
+        Accounting.__post_init__(self)
+        self.rates = RateSchedule(lambda: self.now)
 
 
 class Session:
@@ -88,6 +95,8 @@ class Session:
         "latest",
         "link",
         "queue",
+        "rate_limits",
+        "rated",
         "readable",
         "readable_epoch",
         "received",
@@ -96,6 +105,7 @@ class Session:
         "resends",
         "routes",
         "subscriptions",
+        "topic_bytes",
         "unchecked",
         "will",
         "will_at",
@@ -150,6 +160,12 @@ class Session:
         self.latest: dict[str | int, Delivery] = {}
         #: The large ones among these; empty if the limit `keep` is set, which preserves the order.
         self.large: dict[str | int, Delivery] = {}
+        #: The rates of subscriptions that have one, by filter, and how many messages wait for them.
+        self.rate_limits: dict[str, RateLimit] = {}
+        self.rated = 0
+        #: Bytes of the topics that the rates know. Nothing waits there: they are not in `bytes`,
+        #: and take no room of messages.
+        self.topic_bytes = 0
         #: QoS 2 from the client, waiting for PUBREL.
         self.received: dict[int, UnreleasedPublish] = {}
         self.bytes = 0
@@ -242,7 +258,7 @@ class Session:
         if accounting.limits.queue_full == "disconnect" and link is not None:
             accounting.overflowed.append(self)
         self._report_full(size)
-        self._drop(message)
+        self.drop(message)
         return False
 
     def deliver_promised(self, delivery: Delivery) -> None:
@@ -308,7 +324,7 @@ class Session:
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest)
-            self._drop(oldest[0])
+            self.drop(oldest[0])
         return self.fits(message.size)
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
@@ -416,7 +432,7 @@ class Session:
                 if is_old(delivery[0]):
                     self._uncount(delivery[0])
                     self._settled(delivery)
-                    self._drop(delivery[0])
+                    self.drop(delivery[0])
             self.queue = remaining
             if self.congestion is not None:
                 self._relieve(self.congestion)
@@ -454,7 +470,7 @@ class Session:
             if delivery is not None:
                 self._count(delivery[0])
         for held in received.values():
-            self._take(held_size(held))
+            self.take(held_size(held))
         self._last_packet_id = next(reversed(inflight), 0)
 
     def resend(self) -> None:
@@ -528,6 +544,19 @@ class Session:
         self.accounting.counters.publish_dropped += 1
         return True
 
+    def is_wanted_still(self, message: Message) -> bool:
+        """Whether a message that has waited may be sent; if not, it is counted as dropped.
+
+        It has not expired, and the rules in force let the client receive it.
+        """
+        accounting = self.accounting
+        if accounting.has_expired(message):
+            return False
+        if accounting.may_still_receive(self, message.topic):
+            return True
+        accounting.counters.publish_dropped += 1
+        return False
+
     def keep_latest(self, delivery: Delivery) -> bool:
         """Queue a QoS 0 message for a slow client; False when it was dropped, and counted."""
         message = delivery[0]
@@ -542,7 +571,7 @@ class Session:
             replaced = self.latest.pop(key, None) or self.large.pop(key, None)
         if replaced is not None:
             self._uncount(replaced[0])
-            self._drop(replaced[0])
+            self.drop(replaced[0])
         room = limits.keep or len(self.latest) + len(self.large) < limits.queue_messages
         if room and self.fits(message.size):
             message.settle()
@@ -550,7 +579,7 @@ class Session:
             is_large = message.size > LARGE_MESSAGE and not limits.keep
             (self.large if is_large else self.latest)[key] = delivery
             return True
-        self._drop(message)
+        self.drop(message)
         return False
 
     def overtake(self, topic: str) -> None:
@@ -558,7 +587,7 @@ class Session:
         waiting = self.large.pop(topic, None)
         if waiting is not None:
             self._uncount(waiting[0])
-            self._drop(waiting[0])
+            self.drop(waiting[0])
 
     def _report_full(self, size: int) -> None:
         """Have the full queue logged once in an absence: nobody else notices the lost messages."""
@@ -566,16 +595,16 @@ class Session:
             self.is_full_logged = True
             self.accounting.filled.append((self, self.shortage(size)))
 
-    def _drop(self, message: Message) -> None:
+    def drop(self, message: Message) -> None:
         """Count a message that is dropped because the client is too slow."""
         self.accounting.counters.publish_dropped += 1
         message.dropped()
 
     def _count(self, message: Message) -> None:
-        self._take(message.size)
+        self.take(message.size)
 
     def _uncount(self, message: Message) -> None:
-        self._take(-message.size)
+        self.take(-message.size)
 
     def _settled(self, delivery: Delivery) -> None:
         if self.expiry:
@@ -676,7 +705,7 @@ class Session:
             return False
         held.message.settle()
         self.received[packet_id] = held
-        self._take(held_size(held))
+        self.take(held_size(held))
         if self.expiry:
             self.accounting.store.held(self, packet_id, held)
         return True
@@ -690,7 +719,7 @@ class Session:
         """Remove and return the held message with that id, if there is one."""
         held = self.received.pop(packet_id, None)
         if held is not None:
-            self._take(-held_size(held))
+            self.take(-held_size(held))
             if self.expiry:
                 self.accounting.store.unheld(self, packet_id)
         return held
@@ -700,21 +729,34 @@ class Session:
     def subscribe(self, subscription: Subscription) -> None:
         """Add and count a subscription; it replaces one with the same filter."""
         if subscription.filter not in self.subscriptions:
-            self._take(subscription_size(subscription.filter))
+            self.take(subscription_size(subscription.filter))
         self.subscriptions[subscription.filter] = subscription
+        limit = self.rate_limits.get(subscription.filter)
+        if (limit.rate if limit is not None else 0.0) == subscription.max_rate:
+            return
+        if limit is not None:  # [MQTT-3.8.4-3]: no message is lost because of the replacement
+            del self.rate_limits[subscription.filter]
+            limit.end(sends=True)
+        if subscription.max_rate:
+            self.rate_limits[subscription.filter] = RateLimit(
+                self, subscription.max_rate, self.accounting, self.accounting.rates
+            )
 
     def unsubscribe(self, topic_filter: str) -> bool:
         """Remove a subscription; False when there is none."""
         if self.subscriptions.pop(topic_filter, None) is None:
             return False
         self.replays.pop(topic_filter, None)
-        self._take(-subscription_size(topic_filter))
+        limit = self.rate_limits.pop(topic_filter, None)
+        if limit is not None:
+            limit.end()
+        self.take(-subscription_size(topic_filter))
         return True
 
     def set_will(self, will: PendingWill | None) -> PendingWill | None:
         """Set or remove the will; returns the previous one."""
         before, self.will = self.will, will
-        self._take((will.message.size if will else 0) - (before.message.size if before else 0))
+        self.take((will.message.size if will else 0) - (before.message.size if before else 0))
         return before
 
     def fits(self, size: int) -> bool:
@@ -791,8 +833,25 @@ class Session:
             congestion.end()
             self.congestion = None
 
-    def _take(self, size: int) -> None:
+    def take(self, size: int) -> None:
+        """Count `size` more bytes of memory; negative: fewer."""
         self.bytes += size
+        self.account.bytes += size
+        self.accounting.queued_bytes += size
+
+    def may_know(self, size: int) -> bool:
+        """Whether a rate of the session may know one more topic, of `size` bytes."""
+        accounting, account = self.accounting, self.account
+        return (
+            self.topic_bytes + size <= accounting.session_topics
+            and account.topic_bytes + size <= accounting.user_topics
+            and accounting.fits(account, size)
+        )
+
+    def know(self, size: int) -> None:
+        """Count `size` more bytes of known topics; negative: fewer."""
+        self.topic_bytes += size
+        self.account.topic_bytes += size
         self.account.bytes += size
         self.accounting.queued_bytes += size
 
@@ -838,6 +897,8 @@ class Session:
             for delivery in waiting.values():
                 self._uncount(delivery[0])
             waiting.clear()
+        for limit in self.rate_limits.values():
+            limit.end()
         for topic_filter in list(self.replays):
             if not self.subscriptions[topic_filter].qos:
                 del self.replays[topic_filter]
@@ -849,7 +910,11 @@ class Session:
         if self.congestion is not None:
             self.congestion.end()
             self.congestion = None
-        self._take(-self.bytes)
+        for limit in self.rate_limits.values():
+            limit.end()
+        self.rate_limits.clear()  # they refer to this session: avoid a reference cycle
+        self.take(-self.bytes)
+        self.know(-self.topic_bytes)
         self.will = None
         self.subscriptions.clear()
         for waiting in (self.queue, self.latest, self.large, self.inflight, self.received):

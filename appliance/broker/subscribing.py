@@ -11,11 +11,20 @@ from typing import Final, TypeAlias
 
 from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
+from appliance.broker.max_rate import max_rate
 from appliance.broker.output import in_words
 from appliance.broker.session import Session
 from appliance.broker.values import AccessQuery, Action
 from appliance.mqtt.codec import Properties, Property, quote
-from appliance.mqtt.packets import Packet, Suback, Subscribe, Subscription, Unsuback, Unsubscribe
+from appliance.mqtt.packets import (
+    MAX_RATE,
+    Packet,
+    Suback,
+    Subscribe,
+    Subscription,
+    Unsuback,
+    Unsubscribe,
+)
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_filter, parse_shared
 
@@ -67,11 +76,13 @@ def subscribe(
     wake: Callable[[], None],
     *,
     explains: bool = False,
+    may_explain: bool = False,
 ) -> Iterator[Step]:
     """Process the packet; yields its SUBACK, and None where other clients should have a turn.
 
     If a decision is pending, `wake` is called when the work can continue. With `explains` the
-    SUBACK contains the reason of the first refusal.
+    SUBACK contains the reason of the first refusal; with `may_explain` what is wrong with its
+    max-rate, which is the client's own.
 
     Raises:
         ProtocolError: a filter is invalid, or there are too many; then none has any effect.
@@ -88,12 +99,28 @@ def subscribe(
             yield from answers(broker, lambda asking=questions: asking, wake, until)  # type: ignore[misc]
     identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
     identifier = identifiers[0] if isinstance(identifiers, list) else 0
+    rate, problem = _rate(packet.properties)
     codes: list[int] = []
     words: Properties | None = None
     granted: list[tuple[Subscription, bool]] = []
     for subscription in subscriptions:
         if isinstance(identifier, int):
             subscription.identifier = identifier
+        refusal = problem
+        if rate and not problem:
+            subscription.max_rate = rate
+            subscription.qos = 0  # what is replaced cannot be acknowledged
+            if parse_shared(subscription.filter) is not None:
+                refusal = f"a shared subscription cannot have a {MAX_RATE}"
+        if refusal:
+            codes.append(ReasonCode.IMPLEMENTATION_SPECIFIC_ERROR)
+            name = quote(subscription.filter)
+            broker.log_rate_limited(session, "cannot subscribe to %s: %s", name, refusal)
+            if may_explain and words is None:
+                words = in_words(f"{name}: {refusal}")
+            if turn.is_over(CHECK_COST):
+                yield None
+            continue
         is_new = subscription.filter not in session.subscriptions
         code, reason = broker.subscribe(session, subscription)
         codes.append(code)
@@ -113,6 +140,14 @@ def subscribe(
         if turn.is_over(cost):
             yield None
     session.pump()
+
+
+def _rate(properties: Properties | None) -> tuple[float, str]:
+    """The max-rate of the packet, 0.0 for none, and what is wrong with it, empty for nothing."""
+    try:
+        return max_rate(properties), ""
+    except ValueError as error:
+        return 0.0, str(error)
 
 
 def _questions(session: Session, subscriptions: Sequence[Subscription]) -> list[AccessQuery]:

@@ -61,6 +61,10 @@ class Refusal:
     reason: str
 
 
+#: Codes of a `Refusal` because of who it is or says to be; with others it may come again.
+WRONG_LOGIN = (ReasonCode.NOT_AUTHORIZED, ReasonCode.BAD_USER_NAME_OR_PASSWORD)
+
+
 @dataclass(frozen=True, slots=True)
 class Accepted:
     """The success of an enhanced authentication; `data` goes into the last packet to the client."""

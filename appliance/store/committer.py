@@ -8,10 +8,11 @@ import itertools
 import logging
 import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from appliance.broker.histogram import Histogram
 from appliance.net.callbacks import Entries
 from appliance.store.schema import Durability
 from appliance.store.state import StoreState
@@ -39,6 +40,10 @@ class CommitMetrics:
     messages: int = 0
     #: Messages of the largest batch.
     largest: int = 0
+    #: How long commits took that succeeded.
+    duration: Histogram = field(default_factory=Histogram)
+    #: When the first batch was begun that is not committed yet, by the loop's clock; None for none.
+    begun_at: float | None = None
 
 
 class Committer:
@@ -188,6 +193,8 @@ class Committer:
         self._state.batch += 1
         self.open = Batch(self._state.batch, next(self.keys))
         self._is_writing = True
+        if self.metrics.begun_at is None:
+            self.metrics.begun_at = self._entries.time()
         self._writing = batch.bytes
         self._writer.write(batch)
 
@@ -219,6 +226,9 @@ class Committer:
         if error is None:
             self._state.committed = batch.number
             self.metrics.commits += 1
+            if self.metrics.begun_at is not None:
+                self.metrics.duration.observe(self._entries.time() - self.metrics.begun_at)
+                self.metrics.begun_at = None
             self.metrics.messages += batch.messages
             self.metrics.largest = max(self.metrics.largest, batch.messages)
             if self.failing:

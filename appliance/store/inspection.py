@@ -228,7 +228,12 @@ def export(path: Path) -> Iterator[dict[str, object]]:
             "ends_at": to_date(session.ends_at),
             "will": will,
             "subscriptions": [
-                {"filter": row.filter, "qos": row.qos, "identifier": row.identifier}
+                {
+                    "filter": row.filter,
+                    "qos": row.qos,
+                    "identifier": row.identifier,
+                    "max_rate": row.max_rate or None,
+                }
                 for row in subscriptions[session.id]
             ],
             "messages": [

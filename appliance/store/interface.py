@@ -8,6 +8,7 @@ from typing import Protocol
 from appliance.broker.backlogs import Backlogs
 from appliance.broker.broker import Broker
 from appliance.broker.store import Store
+from appliance.store.committer import CommitMetrics
 
 
 class SessionStore(Store, Protocol):
@@ -24,6 +25,10 @@ class SessionStore(Store, Protocol):
     @property
     def failing(self) -> bool:
         """Whether nothing can be stored now."""
+
+    @property
+    def metrics(self) -> CommitMetrics | None:
+        """What was committed since the start; None when nothing is."""
 
     @property
     def backlogs(self) -> Backlogs:

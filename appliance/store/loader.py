@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar, cast
 
 from appliance.broker.backlogs import Segment
 from appliance.broker.delivery import PendingWill
+from appliance.broker.max_rate import FASTEST_RATE, SLOWEST_RATE
 from appliance.broker.message import Message
 from appliance.broker.saved_sessions import PendingDelivery, SavedSession
 from appliance.broker.values import Identity
@@ -192,6 +193,13 @@ def _within(value: object, low: int, high: int) -> int:
     return number
 
 
+def _rate(value: object) -> float:
+    number = _of(float, value)
+    if number and not SLOWEST_RATE <= number <= FASTEST_RATE:
+        raise _WrongRowError(f"{number} is no rate")
+    return number
+
+
 def _time(value: object, offset: float) -> float | None:
     if value is None:
         return None
@@ -262,6 +270,7 @@ def _take_subscription(row: SubscriptionRow, loaded: Loaded) -> None:
         _within(row.retain_as_published, 0, 1) == 1,
         _within(row.retain_handling, 0, 2),
         _within(row.identifier, 0, 268_435_455),
+        _rate(row.max_rate),
     )
     if topic_filter in session.filters:
         raise _WrongRowError("a second subscription with one filter")

@@ -23,6 +23,7 @@ class MemoryStore(StoreState):
 
     path = None
     failing = False
+    metrics = None
     backlogs: MemoryBacklogs
 
     def __init__(self) -> None:

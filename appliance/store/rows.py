@@ -94,6 +94,7 @@ class SubscriptionRow(NamedTuple):
     retain_handling: Value
     identifier: Value
     replaying: Value = 0
+    max_rate: Value = 0.0
 
 
 class OwedRow(NamedTuple):
@@ -275,6 +276,7 @@ def subscription_row(key: int, session: int, subscription: Subscription, *, repl
         int(subscription.retain_handling),
         subscription.identifier,
         int(replaying),
+        subscription.max_rate,
     )
 
 

@@ -148,6 +148,10 @@ MIGRATIONS: tuple[str, ...] = (
         record BLOB NOT NULL
     );
     """,
+    """
+    -- messages a second of each topic; 0: any
+    ALTER TABLE subscription ADD COLUMN max_rate REAL NOT NULL DEFAULT 0;
+    """,
 )
 
 #: "MQTA" in the header of the database file, so that another program's database is not taken for

@@ -478,6 +478,7 @@ def held_bytes(session: Session) -> int:
         waiting.append(session.will.message)
     rest = sum(map(subscription_size, session.subscriptions))
     rest += sum(held_size(held) for held in session.received.values())
+    rest += sum(limit.size for limit in session.rate_limits.values())
     return sum(message.size for message in waiting) + rest
 
 
@@ -491,7 +492,9 @@ def check_accounts(
     total = 0
     for session in broker.sessions.values():
         assert session.bytes == held_bytes(session), session
-        total += session.bytes
+        topic_bytes = sum(limit.topic_bytes for limit in session.rate_limits.values())
+        assert session.topic_bytes == topic_bytes, session
+        total += session.bytes + topic_bytes
     assert broker.accounting.queued_bytes == total + broker.accounting.input_bytes + wires
     retained = [message for _, message in broker.retained.find("#")]
     retained += [message for _, message in broker.retained.find("$SYS/#")]
@@ -503,10 +506,12 @@ def check_users(broker: Broker, retained: list[Message], wires_of: Mapping[Accou
     """And each user's part of them is what that user holds."""
     accounts = broker.accounting.accounts
     sessions, queued, kept = Counter[Account](), Counter(wires_of), Counter[Account]()
+    topics = Counter[Account]()
     for session in broker.sessions.values():
         account = accounts.inside if session.is_inside else accounts.of(session.identity)
         assert session.account is account
-        queued[account] += session.bytes
+        queued[account] += session.bytes + session.topic_bytes
+        topics[account] += session.topic_bytes
         if not account.is_inside:
             assert (session in account.present) is (session.link is not None), session
             assert (session in account.absent) is (session.link is None), session
@@ -522,6 +527,7 @@ def check_users(broker: Broker, retained: list[Message], wires_of: Mapping[Accou
     for account in users | {accounts.inside}:
         if account is not accounts.strangers:
             assert account.bytes == queued[account], account
+        assert account.topic_bytes == topics[account], account
         assert account.retained == kept[account], account
         if not account.is_inside:
             assert account.sessions == sessions[account], account

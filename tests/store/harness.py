@@ -116,6 +116,8 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
 
     # The others are not restored, so their bytes are not counted.
     forgotten = sum(len(held.full) - len(full(held)) for held in session.received.values())
+    # Nor are messages that wait for a subscription's rate: they have QoS 0.
+    rated = sum(limit.size for limit in session.rate_limits.values())
     will = session.will
     return {
         "identity": session.identity,
@@ -131,7 +133,7 @@ def _session(broker: Broker, session: Session) -> dict[str, Any]:
             number: (_message(held.message), full(held))
             for number, held in session.received.items()
         },
-        "bytes": session.bytes - forgotten * FULL_SIZE,
+        "bytes": session.bytes - forgotten * FULL_SIZE - rated,
     }
 
 

@@ -64,7 +64,9 @@ def test_what_is_kept_is_shown_and_exported_while_it_runs(process: ApplianceProc
     lines = [json.loads(line) for line in store(process, "export").stdout.splitlines()]
     first = next(line for line in lines if line.get("session") == "first")
     assert first["user"] == "alice" and first["expiry"] == 7 * 86400 and first["ends_at"]
-    assert first["subscriptions"] == [{"filter": "r2d2/a", "qos": 1, "identifier": 0}]
+    assert first["subscriptions"] == [
+        {"filter": "r2d2/a", "qos": 1, "identifier": 0, "max_rate": None}
+    ]
     text, binary = first["messages"]
     assert text["payload"] == "text" and binary["payload_base64"] == "/wA="
     retained = {line["retained"]["topic"] for line in lines if "retained" in line}

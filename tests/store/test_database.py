@@ -157,7 +157,7 @@ async def test_a_newer_database_is_left_alone(
     await harness.stop()
     monkeypatch.setattr(schema, "MIGRATIONS", ())
     before = harness.path.read_bytes()
-    with pytest.raises(StoreError, match=r"newer appliance \(version 5 .* knows 0\)"):
+    with pytest.raises(StoreError, match=r"newer appliance \(version 6 .* knows 0\)"):
         SqliteStore(harness.path).open()
     assert harness.path.read_bytes() == before
 

@@ -15,11 +15,15 @@ import pytest_asyncio
 from waiting import until
 
 from appliance.broker.backlogs import NO_MESSAGE, SEGMENT_SIZE, Journal, RecordsLostError, Segment
+from appliance.mqtt.codec import NO_PROPERTIES
 from appliance.net.callbacks import Entries
 from appliance.store import StoreError, committer
 from appliance.store import journal as journal_module
-from appliance.store.inspection import export, prune_upstream, summarise
+from appliance.store.inspection import export, prune, prune_retained, prune_upstream, summarise
 from appliance.store.journal import SMALL
+from appliance.upstream.backlog import Backlog
+from appliance.upstream.live_messages import LATEST_SIZE
+from appliance.upstream.rules import BacklogLimits, OutRule
 from store.harness import Harness
 
 
@@ -28,6 +32,9 @@ async def harness(tmp_path: Path) -> AsyncIterator[Harness]:
     harness = Harness(tmp_path / "first").start()
     yield harness
     await harness.stop()
+
+
+LATEST_RULE = OutRule("#", "r/", "fleet/", "latest")
 
 
 def opened(harness: Harness, link: str = "fleet", lane: int = 0) -> Journal:
@@ -472,6 +479,59 @@ async def test_what_waits_is_shown_and_pruned(harness: Harness) -> None:
     harness.start()
     assert harness.store.backlogs.links() == ["other"]
     assert await unsettled(opened(harness, "other")) == [b"x"]
+
+
+def backlog(harness: Harness, name: str) -> Backlog:
+    """The backlog of a link, which has one rule."""
+    backlogs = harness.store.backlogs
+    now = backlogs.journal(name, 0).now()
+    return Backlog(name, backlogs, [LATEST_RULE], BacklogLimits(), now, lambda: None)
+
+
+async def drained(waiting: Backlog) -> dict[str, bytes]:
+    """What waits, by topic."""
+    found: dict[str, bytes] = {}
+
+    def is_drained() -> bool:
+        while (entry := waiting.next(1e9)) is not None:
+            found[entry.record.topic] = entry.record.payload
+            waiting.settle(entry)
+        return not waiting.counts().waiting
+
+    waiting.connected()
+    await until(is_drained, "all to be read and handed out")
+    return found
+
+
+async def test_values_that_are_only_on_disk_are_shown_and_pruned(harness: Harness) -> None:
+    """A state that memory has no room for is a row that says what it is, and another one."""
+    size = LATEST_SIZE // 3
+    values = {f"t{number}": b"%d" % number + bytes(size) for number in range(6)}
+    for name in ("fleet", "other"):
+        waiting = backlog(harness, name)
+        for number in range(2):  # the second time in place of the first
+            for topic, value in values.items():
+                payload = value if number else bytes(size)
+                waiting.offer(LATEST_RULE, topic, payload, 1, False, NO_PROPERTIES, None, 0.0)
+                await harness.written()
+        assert len(harness.store.backlogs.single(name).load()) == 4  # two are in memory
+    shown = summarise(harness.path).backlogs
+    assert [(each.link, each.lane, each.messages) for each in shown] == [
+        *(("fleet", "latest", 6), ("other", "latest", 6))
+    ]
+    assert all(6 * size < each.size < 6 * size + 2000 for each in shown)
+    await harness.stop()
+    before = harness.path.stat().st_size
+    assert prune(harness.path, None, []) == (0, 0) and not prune_retained(harness.path, ["#"])
+    assert prune_upstream(harness.path, "fleet") == 6
+    assert (
+        keys(harness, "segment") == keys(harness, "backlog") and len(keys(harness, "backlog")) == 4
+    )
+    assert harness.path.stat().st_size < 0.6 * before
+    harness.start()
+    assert harness.store.backlogs.links() == ["other"]
+    assert not await drained(backlog(harness, "fleet"))
+    assert await drained(backlog(harness, "other")) == values
 
 
 class Twin:

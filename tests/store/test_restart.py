@@ -159,7 +159,8 @@ async def test_a_store_of_before_replays_were_in_it(tmp_path: Path) -> None:
     client.send(Subscribe(1, [Subscription("a", 1)]))
     await harness.stop()
     with contextlib.closing(sqlite3.connect(harness.path)) as connection:
-        connection.execute("ALTER TABLE subscription DROP COLUMN replaying")
+        for column in ("replaying", "max_rate"):
+            connection.execute(f"ALTER TABLE subscription DROP COLUMN {column}")
         connection.execute("UPDATE about SET version = 2")
         connection.execute("PRAGMA user_version = 2")
         connection.commit()
@@ -514,6 +515,8 @@ class Chaos:
             subscription.no_local = dice.random() < 0.3 and not topic_filter.startswith("$")
             if dice.random() < 0.5:
                 properties = {Property.SUBSCRIPTION_IDENTIFIER: [dice.randrange(1, 300)]}
+            elif dice.random() < 0.3:
+                properties = {Property.USER_PROPERTY: [("max-rate", "0.5")]}
         peer.send(Subscribe(1, [subscription], properties))
 
     def _unsubscribe(self, name: str, peer: Peer) -> None:
@@ -605,6 +608,7 @@ async def test_a_store_of_an_older_appliance_does_not_say_whose_a_message_is(
     with contextlib.closing(sqlite3.connect(older / "state/store.db")) as database:
         for column in ("username", "inside"):
             database.execute(f"ALTER TABLE retained DROP COLUMN {column}")
+        database.execute("ALTER TABLE subscription DROP COLUMN max_rate")
         database.execute("UPDATE about SET version = 3")
         database.execute("PRAGMA user_version = 3")
         database.commit()
