@@ -41,12 +41,20 @@ from appliance.ros.payload.schema import json_schema, topic_of
 from appliance.ros.retained_cleanup import RetainedCleanup, TopicOwners
 from appliance.ros.ros2.discovery import TWIN, TWIN_ADVICE
 from appliance.ros.skipped import Skipped, ordered, summary
-from appliance.ros.status import RouteStatus, TopicStatus, route_status, topic_status
+from appliance.ros.status import (
+    RouteStatus,
+    RouteTotal,
+    TopicStatus,
+    route_status,
+    route_total,
+    topic_status,
+)
 from appliance.ros.topics.commands import Commands
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
 from appliance.ros.topics.factory import FlowFactory
 from appliance.ros.topics.flow import Flow
 from appliance.ros.topics.lease import BRIDGE_CLIENT_ID, Leases
+from appliance.ros.topics.off_loop import ConversionThreads
 from appliance.ros.topics.route import BridgedTopic, BridgeRoute, Direction, TopicSettings
 from appliance.ros.topics.staleness import StalenessDetector
 from appliance.ros.topics.to_ros import ToRos, ToRosContext
@@ -71,6 +79,9 @@ LONGEST_RETRY = 60.0
 #: the metrics in `{robot}/_appliance/routes`.
 METER_INTERVAL = 1.0
 METERS_TO_ANNOUNCE = 10
+
+#: Seconds until it is announced that another client commands, or none: others may follow at once.
+ANNOUNCE_LEASE = 0.2
 
 #: Seconds from joining the bus on for which a topic of a pattern that is not there is expected.
 DISCOVERY = 10.0
@@ -128,11 +139,18 @@ class Bridge:
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
         self._conversions = ConversionQueue(entries, broker.accounting)
+        self._threads = ConversionThreads(entries)
         self._context = ToRosContext(
-            entries, self._post, broker, Leases(), self._conversions, StalenessDetector()
+            entries,
+            self._post,
+            broker,
+            Leases(self._announce_soon),
+            self._conversions,
+            StalenessDetector(),
         )
         self._meter_timer: PeriodicCallback | None = None
         self._metered = 0
+        self._announce_timer: asyncio.TimerHandle | None = None
         #: The payloads that were published last.
         self._announced = b""
         self._announced_skips = b""
@@ -147,7 +165,12 @@ class Bridge:
         self._receivers: dict[str, list[ToRos]] = {}
         self._subscribed: dict[str, Subscription] = {}
         self._factory = FlowFactory(
-            self._converters, self._log, self._mailbox, self._publish, self._context
+            self._converters,
+            self._log,
+            self._mailbox,
+            self._publish,
+            self._context,
+            self._threads,
         )
         #: Services, actions and parameters.
         self.calls = CallBridge(
@@ -302,6 +325,8 @@ class Bridge:
             self._retry_timer.cancel()
         if self._meter_timer is not None:
             self._meter_timer.cancel()
+        if self._announce_timer is not None:
+            self._announce_timer.cancel()
         if self._diagnostics is not None:
             self._diagnostics.stop()
         for flow in self._to_ros.values():
@@ -311,6 +336,7 @@ class Bridge:
             self._broker.obstacles.remove(self._obstacle)
         await self.calls.leave()
         await asyncio.to_thread(self._node.stop)
+        self._threads.close()
         session = self._session
         if session is None:
             return
@@ -325,10 +351,17 @@ class Bridge:
 
     def status(self) -> list[RouteStatus]:
         """Every route's state and counters, one entry a direction."""
+        return [route_status(route, flows) for route, flows in self._by_route()]
+
+    def totals(self) -> list[RouteTotal]:
+        """Every route's counters alone, one entry a direction."""
+        return [route_total(route, flows) for route, flows in self._by_route()]
+
+    def _by_route(self) -> list[tuple[BridgeRoute, list[Flow]]]:
         flows: dict[BridgeRoute, list[Flow]] = {}
         for flow in self._flows():
             flows.setdefault(flow.route, []).append(flow)
-        return [route_status(route, flows.get(route, [])) for route in self._routes]
+        return [(route, flows.get(route, [])) for route in self._routes]
 
     def topics(self) -> list[TopicStatus]:
         """What is bridged now, with its metrics."""
@@ -459,6 +492,17 @@ class Bridge:
             self._publish_retained(self._skipped_topic, payload, self._session)
             self._broker.flush()
 
+    def _announce_soon(self) -> None:
+        """Another client holds a lease, or none does: announce that, with what follows."""
+        if self._announce_timer is None and not self._is_stopping:
+            self._announce_timer = self._entries.later(
+                "bridge.announce", ANNOUNCE_LEASE, self._announce_lease
+            )
+
+    def _announce_lease(self) -> None:
+        self._announce_timer = None
+        self._announce()
+
     def _publish_retained(self, topic: str, payload: bytes, session: Session) -> None:
         self._broker.publish(Message(topic, payload, 0, True, JSON_PROPERTIES), session)
 
@@ -524,7 +568,10 @@ class Bridge:
 
     def on_ended(self, flow: Flow) -> None:
         """A flow that the follower has made is closed: its route goes on with its counters."""
-        flow.route.past.add(flow.total())
+        try:
+            flow.finish()
+        finally:
+            flow.route.past.add(flow.total())
 
     def on_bridged_changed(self) -> None:
         """Other topics are bridged, or refused, than before."""

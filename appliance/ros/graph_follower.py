@@ -123,6 +123,8 @@ class GraphFollower:
         #: For the loop's thread.
         self._followed = FollowedTopics()
         self._is_joined = False
+        #: Whether other routes have been taken over, which is not reported yet.
+        self._has_followed = False
         self._polls = 0
         self._to_mqtt: dict[FlowKey, ToMqtt] = {}
         self._matched: dict[FlowKey, ToRos] = {}
@@ -210,6 +212,10 @@ class GraphFollower:
         ended, self._ended = self._ended, []
         for flow in ended:
             self._post(self._events.on_ended, flow)
+        if self._has_followed:
+            self._has_followed = False
+            # What flows of old routes had sent is behind us then.
+            self._post(self._events.on_routes_followed)
 
     def _poll_flows(self) -> bool:
         """Let each flow follow its topic; returns whether what is bridged has changed.
@@ -239,8 +245,7 @@ class GraphFollower:
             return False
         self._current = wanted
         self._topics = None
-        # What flows of old routes had sent is behind us then.
-        self._post(self._events.on_routes_followed)
+        self._has_followed = True
         has_changed = False
         for key, named in ({} if current is None else current.to_ros).items():
             if wanted.to_ros.get(key) is not named:

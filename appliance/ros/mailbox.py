@@ -116,6 +116,16 @@ class Mailbox:
                 self._is_awake = False
         return taken, not is_all
 
+    def take_of(self, lane: Lane) -> list[Message]:
+        """Take all messages of a lane, which has ended."""
+        with self._lock:
+            taken = list(lane.waiting)
+            lane.waiting.clear()
+            self._messages -= len(taken)
+            self._bytes -= sum(len(message.payload) for message in taken)
+            self._place(lane)
+            return taken
+
     def _place(self, lane: Lane) -> None:
         """Queue a lane by the size of its next message; it keeps its turn if already there."""
         wanted = None

@@ -2,51 +2,10 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from dataclasses import dataclass, field, fields, replace
-from itertools import accumulate
+from dataclasses import dataclass, field
 from time import monotonic
 
-#: The upper bounds of the latency histogram's buckets, in seconds; one more bucket is for the rest.
-BOUNDS = (
-    *(0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05),
-    *(0.1, 0.2, 0.5, 1.0, 2.0, 5.0),
-)
-
-
-class Latency:
-    """A histogram of latencies, in seconds."""
-
-    __slots__ = ("counts", "total")
-
-    def __init__(self) -> None:
-        #: The count of each bucket of BOUNDS, and of the one above.
-        self.counts = [0] * (len(BOUNDS) + 1)
-        #: The sum of all latencies, in seconds.
-        self.total = 0.0
-
-    def observe(self, seconds: float) -> None:
-        """Count a latency. A negative one, from a clock that is ahead of ours, counts as 0."""
-        self.counts[bisect_left(BOUNDS, seconds)] += 1
-        self.total += max(seconds, 0.0)
-
-    def add(self, other: Latency) -> None:
-        """Add the counts of another histogram."""
-        self.counts = [one + more for one, more in zip(self.counts, other.counts, strict=True)]
-        self.total += other.total
-
-    def quantile(self, share: float) -> float | None:
-        """The quantile in seconds, interpolated within its bucket; None without any latencies."""
-        wanted = share * sum(self.counts)
-        if not wanted:
-            return None
-        sums = list(accumulate(self.counts))
-        index = bisect_left(sums, wanted)
-        if index == len(BOUNDS):
-            return BOUNDS[-1]
-        low = BOUNDS[index - 1] if index else 0.0
-        before = sums[index] - self.counts[index]
-        return low + (BOUNDS[index] - low) * (wanted - before) / self.counts[index]
+from appliance.broker.histogram import Histogram
 
 
 @dataclass(eq=False, slots=True)
@@ -89,25 +48,32 @@ class FlowCounters(ReceiveCounters):
     refused: int = 0
     clamped: int = 0
     stops: int = 0
-    latency: Latency = field(default_factory=Latency)
-
-    def with_received(self, other: ReceiveCounters) -> FlowCounters:
-        """A copy, with what another thread has counted of the same messages."""
-        last = self if self.last_error_at >= other.last_error_at else other
-        return replace(
-            self,
-            lost=self.lost + other.lost,
-            throttled=self.throttled + other.throttled,
-            errors=self.errors + other.errors,
-            last_error=last.last_error,
-            last_error_at=last.last_error_at,
-        )
+    latency: Histogram = field(default_factory=Histogram)
 
     def add(self, other: FlowCounters) -> None:
         """Add the counts of others; their last error becomes the last one."""
-        for item in fields(self):
-            if item.type == "int":
-                total = getattr(self, item.name) + getattr(other, item.name)
-                setattr(self, item.name, total)
-        self.last_error = other.last_error or self.last_error
-        self.latency.add(other.latency)
+        # One by one: a loop over the fields takes ten times as long, for each route of `/metrics`.
+        self.messages += other.messages
+        self.bytes += other.bytes
+        self.dropped += other.dropped
+        self.skipped += other.skipped
+        self.expired += other.expired
+        self.refused += other.refused
+        self.clamped += other.clamped
+        self.stops += other.stops
+        if other.latency.total or other.latency.counts[0]:
+            self.latency.add(other.latency)
+        self._add_received(other)
+        if other.last_error is not None:
+            self.last_error, self.last_error_at = other.last_error, other.last_error_at
+
+    def add_received(self, other: ReceiveCounters) -> None:
+        """Add what another thread has counted of the same messages."""
+        self._add_received(other)
+        if other.last_error is not None and other.last_error_at > self.last_error_at:
+            self.last_error, self.last_error_at = other.last_error, other.last_error_at
+
+    def _add_received(self, other: ReceiveCounters) -> None:
+        self.lost += other.lost
+        self.throttled += other.throttled
+        self.errors += other.errors

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from appliance.ros.metrics import FlowCounters, Latency
+from appliance.broker.histogram import Histogram
+from appliance.ros.metrics import FlowCounters
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.topics.flow import Flow
 from appliance.ros.topics.route import BridgedTopic, BridgeRoute, Direction, TopicSettings
@@ -20,12 +21,29 @@ class LatencyStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class CommandStatus:
+    """What a route to ROS does to commands, for who drives; times in seconds.
+
+    `clamp` has the bounds of fields by their path. `on_silence` is the time after which the stop
+    message follows, None without one. `lease` is how long a silent client holds the topic, None if
+    it is not exclusive, and `commanding` is who holds it.
+    """
+
+    clamp: dict[str, tuple[float, float]]
+    on_silence: float | None
+    exclusive: bool
+    lease: float | None
+    commanding: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class TopicStatus:
     """A topic that is bridged now; as JSON an entry of `{robot}/_appliance/routes`.
 
     `rate` is in messages per second, `size` the mean payload in bytes, `latency_ms` from the
     publisher on ROS to the broker, None if none was measured. `last_error` is the problem with the
-    last message that was not carried. The counters are `FlowCounters` since the topic came.
+    last message that was not carried. The counters are `FlowCounters` since the topic came. `rules`
+    are those of a topic to ROS, None if its route has none.
     """
 
     ros: str
@@ -45,6 +63,7 @@ class TopicStatus:
     refused: int
     last_error: str | None
     latency_ms: LatencyStatus | None
+    rules: CommandStatus | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +95,16 @@ class RouteStatus:
     commanding: tuple[tuple[str, str], ...]
 
 
+@dataclass(frozen=True, slots=True)
+class RouteTotal:
+    """The counters of a route in one direction since the start, and how many topics it bridges."""
+
+    settings: TopicSettings
+    direction: Direction
+    topics: int
+    counters: FlowCounters
+
+
 def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
     """The status of a flow that is bridged."""
     counters = flow.total()
@@ -97,14 +126,36 @@ def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
         counters.refused,
         counters.last_error,
         latency_status(counters.latency),
+        _command_status(bridged, flow),
     )
+
+
+def _command_status(bridged: BridgedTopic, flow: Flow) -> CommandStatus | None:
+    rules = flow.settings.rules
+    if rules is None or bridged.direction == "to_mqtt":
+        return None
+    return CommandStatus(
+        {path: (low, high) for path, low, high in rules.clamp},
+        None if rules.on_silence is None else rules.on_silence.after,
+        rules.exclusive,
+        rules.lease if rules.exclusive else None,
+        flow.commanding,
+    )
+
+
+def route_total(route: BridgeRoute, flows: Sequence[Flow]) -> RouteTotal:
+    """The counters of a route, with its present and past flows."""
+    total = FlowCounters()
+    total.add(route.past)
+    for flow in flows:
+        flow.add_to(total)
+    bridged = sum(flow.bridged is not None for flow in flows)
+    return RouteTotal(route.settings, route.direction, bridged, total)
 
 
 def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
     """The status of a route, with its present and past flows."""
-    total = FlowCounters()
-    for counters in (route.past, *(flow.total() for flow in flows)):
-        total.add(counters)
+    total = route_total(route, flows).counters
     rates = [flow.meter.rates for flow in flows]
     return RouteStatus(
         route.settings,
@@ -129,7 +180,7 @@ def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
     )
 
 
-def latency_status(latency: Latency) -> LatencyStatus | None:
+def latency_status(latency: Histogram) -> LatencyStatus | None:
     """The summary of a histogram, None for an empty one."""
     p50, p99 = latency.quantile(0.5), latency.quantile(0.99)
     if p50 is None or p99 is None:

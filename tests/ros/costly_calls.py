@@ -15,7 +15,6 @@ import fnmatch
 import json
 import math
 import multiprocessing
-import os
 import subprocess
 import sys
 import tempfile
@@ -32,6 +31,7 @@ sys.path.insert(0, str(HERE.parent / "hostile"))
 import cbor2  # noqa: E402
 import zstandard  # noqa: E402
 from appliance_process import ApplianceProcess  # noqa: E402
+from load import yield_to_all  # noqa: E402
 from witness import Over, Report, Target, Witness  # noqa: E402
 
 from appliance.mqtt.codec import Property  # noqa: E402
@@ -329,7 +329,7 @@ async def _attack(name: str, target: Target, seconds: float) -> Counter[str]:
 
 
 def _serve(pipe: multiprocessing.connection.Connection) -> None:
-    os.nice(10)
+    yield_to_all()
     while True:
         pipe.send(asyncio.run(_attack(*pipe.recv())))
 

@@ -12,7 +12,7 @@ import pytest
 
 from appliance.host.environment import for_other_programs
 
-pytestmark = pytest.mark.usefixtures("isolated_domain")
+pytestmark = [pytest.mark.timed, pytest.mark.usefixtures("isolated_domain")]
 
 pytest.importorskip("rclpy")
 

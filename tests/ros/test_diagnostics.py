@@ -8,9 +8,10 @@ import logging
 import pytest
 
 from appliance.broker.broker import Broker
+from appliance.broker.histogram import BOUNDS, Histogram
 from appliance.broker.meter import Meter
 from appliance.ros.bridge import Bridge
-from appliance.ros.metrics import BOUNDS, FlowCounters, Latency
+from appliance.ros.metrics import FlowCounters
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules
 
@@ -196,14 +197,14 @@ def test_a_stop_before_the_start_is_nothing():
 
 
 def test_latency():
-    latency = Latency()
+    latency = Histogram()
     assert latency.quantile(0.5) is None
     for milliseconds in range(1, 101):
         latency.observe(milliseconds / 1000)
     assert latency.quantile(0.5) == pytest.approx(0.05, abs=0.002)
     assert latency.quantile(0.99) == pytest.approx(0.1, abs=0.003)
     assert latency.total == pytest.approx(5.05)
-    other = Latency()
+    other = Histogram()
     other.observe(-1)
     other.observe(100)
     assert other.quantile(1) == BOUNDS[-1]

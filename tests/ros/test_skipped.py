@@ -214,7 +214,7 @@ def entry(number, why="left_out"):
 def test_the_command(tmp_path, monkeypatch, capsys, arguments):
     (tmp_path / "appliance.yaml").write_text("")
     skips = [entry(1, "problem"), *map(entry, range(2, 33)), entry(40, "of_every_node")]
-    monkeypatch.setattr(control, "ask", lambda path, what: skips if what == "skipped" else [])
+    monkeypatch.setattr(control, "ask", lambda path, what, **_: skips if what == "skipped" else [])
     with pytest.raises(SystemExit) as ended:
         cli.main(["routes", "-c", str(tmp_path / "appliance.yaml"), *arguments])
     assert ended.value.code == 0
@@ -249,7 +249,7 @@ def carried(**counts):
 def test_the_command_says_what_ros_lost_and_what_to_do(tmp_path, monkeypatch, capsys):
     (tmp_path / "appliance.yaml").write_text("")
     told = [carried(lost=88, dropped=3)]
-    monkeypatch.setattr(control, "ask", lambda path, what: [] if what == "skipped" else told)
+    monkeypatch.setattr(control, "ask", lambda path, what, **_: [] if what == "skipped" else told)
     with pytest.raises(SystemExit):
         cli.main(["routes", "-c", str(tmp_path / "appliance.yaml")])
     head, row, *rest = capsys.readouterr().out.splitlines()
@@ -265,7 +265,7 @@ def test_the_command_says_what_ros_lost_and_what_to_do(tmp_path, monkeypatch, ca
 def test_the_command_says_what_was_wrong_last(tmp_path, monkeypatch, capsys):
     (tmp_path / "appliance.yaml").write_text("")
     told = [carried(direction="to_ros", errors=2, last_error="cannot be converted: not JSON")]
-    monkeypatch.setattr(control, "ask", lambda path, what: [] if what == "skipped" else told)
+    monkeypatch.setattr(control, "ask", lambda path, what, **_: [] if what == "skipped" else told)
     with pytest.raises(SystemExit):
         cli.main(["routes", "-c", str(tmp_path / "appliance.yaml")])
     lines = capsys.readouterr().out.splitlines()

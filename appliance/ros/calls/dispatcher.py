@@ -33,6 +33,7 @@ from functools import partial
 from typing import Literal, TypeAlias, TypeVar
 
 from appliance.broker.broker import Broker
+from appliance.broker.histogram import Histogram
 from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
 from appliance.broker.session import Session, publisher_of
@@ -72,6 +73,8 @@ ErrorCode: TypeAlias = Literal[
     "unknown_goal",  # the action's server knows of no such goal, or it has ended
     "unknown_type",  # the type is not installed here
     "ros_error",  # ROS itself refused, or is not there
+    "not_found",  # the appliance knows no such client, user or certificate
+    "failed",  # the appliance could not do it
     "stopping",  # the appliance stops
 ]
 
@@ -124,6 +127,8 @@ class CallLimits:
     total: int = 500
     user: int | None = None
     input: InputLimits = field(default_factory=InputLimits)
+    #: Where these are set in appliance.yaml; empty for limits that are not.
+    section: str = "bridge.limits"
 
     @property
     def share(self) -> int:
@@ -155,23 +160,23 @@ class ConcurrencyLimiter:
     def __contains__(self, client: Session) -> bool:
         return client in self._clients
 
+    def __len__(self) -> int:
+        return self._total
+
     def check(self, client: Session, limits: CallLimits) -> None:
         """Raises CallError when there is no slot left for the client."""
         if self._clients[client] >= limits.client:
-            raise self._full(limits.client, "this client", "calls_per_client")
+            raise self._full(limits, limits.client, "this client", "calls_per_client")
         user = user_of(client)
         if self._users[user] >= limits.share:
             whose = "the clients without a user" if user is None else f"the user {quote(user)}"
-            raise self._full(limits.share, whose, "calls_per_user")
+            raise self._full(limits, limits.share, whose, "calls_per_user")
         if self._total >= limits.total and not self._ignores_total:
-            raise self._full(limits.total, "all clients", "calls")
+            raise self._full(limits, limits.total, "all clients", "calls")
 
-    def _full(self, count: int, whose: str, key: str) -> CallError:
-        return CallError(
-            "too_many",
-            f"{count} {self._what} of {whose} are under way, as many as may be "
-            f"(bridge.limits.{key})",
-        )
+    def _full(self, limits: CallLimits, count: int, whose: str, key: str) -> CallError:
+        text = f"{count} {self._what} of {whose} are under way, as many as may be"
+        return CallError("too_many", f"{text} ({limits.section}.{key})" if limits.section else text)
 
     def acquire(self, client: Session) -> Slot:
         """Acquire a slot that `check` has found to be free."""
@@ -197,6 +202,8 @@ class CallCounters:
     under_way: int = 0
     errors: Counter[str] = field(default_factory=Counter)
     last_error: str | None = None
+    #: How long calls took that had a slot, answered or not.
+    duration: Histogram = field(default_factory=Histogram)
 
 
 @dataclass(eq=False, slots=True)
@@ -215,6 +222,7 @@ class Call:
     encoding: EncodingName
     encoding_note: str = ""
     has_timed_out: bool = False
+    begun_at: float = 0.0
     slot: Slot | None = None
     timer: asyncio.TimerHandle | None = None
     task: asyncio.Task[None] | None = None
@@ -230,7 +238,8 @@ class CallEndpoint:
 
     `name` is for the log and for errors. `timeout` is in seconds. `encoding` is that of calls that
     name none, and `encodings` are those that are accepted. `max_bytes` limits the payload. Calls
-    that cancel goals (`is_cancel`) have slots of their own.
+    that cancel goals (`is_cancel`) have slots of their own. `fault` is the code of an answer that a
+    fault has prevented.
     """
 
     topic: str
@@ -242,6 +251,7 @@ class CallEndpoint:
     encodings: tuple[EncodingName, ...] = WITHOUT_RAW
     max_bytes: int | None = None
     is_cancel: bool = False
+    fault: ErrorCode = "ros_error"
 
 
 MessageHandler: TypeAlias = Callable[[Session, Message], None]
@@ -250,8 +260,16 @@ MessageHandler: TypeAlias = Callable[[Session, Message], None]
 class CallDispatcher:
     """Receives calls from MQTT, dispatches them to endpoints and publishes the answers."""
 
-    def __init__(self, broker: Broker, entries: Entries, conversions: ConversionQueue) -> None:
+    def __init__(
+        self,
+        broker: Broker,
+        entries: Entries,
+        conversions: ConversionQueue,
+        client_id: str = CLIENT_ID,
+    ) -> None:
+        """`client_id` is that of its session inside the broker."""
         self.limits = CallLimits()
+        self._client_id = client_id
         self.conversions = conversions
         self._replay_guard = ReplayGuard()
         self._broker = broker
@@ -272,7 +290,7 @@ class CallDispatcher:
 
     def start(self) -> None:
         """Subscribe to calls."""
-        self._session = self._broker.attach(CLIENT_ID, ReceivingLink(self._receive))
+        self._session = self._broker.attach(self._client_id, ReceivingLink(self._receive))
         self._broker.departures.append(self._replay_guard.departed)
         for topic_filter in self._identifiers:
             self._subscribe_session(topic_filter)
@@ -435,6 +453,7 @@ class CallDispatcher:
         slots = self._cancel_slots if endpoint.is_cancel else self._slots
         call.slot = slots.acquire(call.caller)
         endpoint.counters.under_way += 1
+        call.begun_at = self._loop.time()
         self._calls[call] = endpoint
         self._bytes[call.slot.user] += len(call.payload)
         call.timer = self._entries.later(
@@ -451,7 +470,7 @@ class CallDispatcher:
             self._reject(call, error)
         except Exception as problem:  # a fault must not leave the caller without an answer
             self._entries.faults.caught("calls.take", problem, endpoint.name)
-            self._reject(call, CallError("ros_error", repr(problem)))
+            self._reject(call, CallError(endpoint.fault, repr(problem)))
         else:
             call.task = self._entries.task(
                 "calls.call", self._run(endpoint, call, find_answer), served=endpoint.name
@@ -580,7 +599,7 @@ class CallDispatcher:
             self._send_error(endpoint, call, _ended(endpoint, call))
         except Exception as problem:  # a fault must not leave the caller without an answer
             self._entries.faults.caught("calls.handle", problem, endpoint.name)
-            self._send_error(endpoint, call, CallError("ros_error", repr(problem)))
+            self._send_error(endpoint, call, CallError(endpoint.fault, repr(problem)))
         else:
             endpoint.counters.answers += 1
             user_properties = [("status", "ok")]
@@ -606,6 +625,7 @@ class CallDispatcher:
         if call.timer is not None:
             call.timer.cancel()
         endpoint.counters.under_way -= 1
+        endpoint.counters.duration.observe(self._loop.time() - call.begun_at)
         assert call.slot is not None
         _subtract(self._bytes, call.slot.user, len(call.payload))
         (self._cancel_slots if endpoint.is_cancel else self._slots).release(call.slot)

@@ -188,6 +188,11 @@ class CallBridge:
         self._services.stop()
         await self.dispatcher.stop()
 
+    @property
+    def goals(self) -> int:
+        """Goals of MQTT clients that are under way."""
+        return len(self._actions.goals.slots)
+
     def status(self) -> list[CallStatus]:
         """Every route's state and counters."""
         found: list[tuple[AnySettings, CallCounters, list[str]]] = [

@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 from appliance.mqtt.codec import Properties, Property
 from appliance.ros.payload.converter import Converter
 from appliance.ros.payload.cost import DEFAULT_ITEMS, over_limit
-from appliance.ros.payload.encodings.base import Encoding, EncodingName
+from appliance.ros.payload.encodings.base import Encoding, EncodingName, PictureOptions
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.fallback import ConversionError, TooLargeError
 
@@ -62,6 +62,7 @@ def packer(
     encoding: EncodingName,
     compression: Compression,
     about: list[tuple[str, str]],
+    picture: PictureOptions = PictureOptions(),  # noqa: B008 - it is frozen
 ) -> Callable[[bytes], tuple[bytes, Properties]]:
     """The function that makes payload and properties of a serialized message.
 
@@ -74,7 +75,7 @@ def packer(
         Property.CONTENT_TYPE: ENCODINGS[encoding].content_type,
         Property.USER_PROPERTY: about,
     }
-    pack = ENCODINGS[encoding].packer(converter, properties)
+    pack = ENCODINGS[encoding].with_picture(picture).packer(converter, properties)
     if compression == "none":
         return pack
     compress = _compressor()

@@ -10,6 +10,7 @@ from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.payload.converter import Converters
 from appliance.ros.topics.commands import Commands
 from appliance.ros.topics.follower import RoutedTopic
+from appliance.ros.topics.off_loop import ConversionThreads
 from appliance.ros.topics.route import BridgeRoute, LogFunction
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import ToRos, ToRosContext
@@ -27,10 +28,11 @@ class FlowFactory:
     mailbox: Mailbox
     publish: Callable[[Iterable[tuple[Lane, Message]]], None]
     context: ToRosContext
+    threads: ConversionThreads
 
     def to_mqtt(self, route: BridgeRoute, ros: str) -> ToMqtt:
         """A flow from a ROS topic to MQTT."""
-        return ToMqtt(self._topic(route, ros), self.mailbox, self.publish)
+        return ToMqtt(self._topic(route, ros), self.mailbox, self.publish, self.threads)
 
     def to_ros(self, route: BridgeRoute, ros: str) -> ToRos:
         """A flow from MQTT to a ROS topic, with the route's command rules if it has some."""

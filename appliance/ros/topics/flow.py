@@ -73,7 +73,17 @@ class Flow:
 
     def total(self) -> FlowCounters:
         """The counters of both threads, added up."""
-        return self.counters.with_received(self.follower.counters)
+        total = FlowCounters()
+        self.add_to(total)
+        return total
+
+    def add_to(self, total: FlowCounters) -> None:
+        """Add the counters of both threads."""
+        total.add(self.counters)
+        total.add_received(self.follower.counters)
+
+    def finish(self) -> None:
+        """The follower has closed: carry what has come before and still waits."""
 
     def skips(self) -> list[Skipped]:
         """What of the topic is not carried, and why."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 from weakref import WeakValueDictionary
@@ -61,9 +62,11 @@ class Lease:
     commands: otherwise no held or queued command would be carried out beside an idle joystick.
     """
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self, topic: str, changed: Callable[[], object] = lambda: None) -> None:
+        """`changed` is called when another client holds it, or none does."""
         self.topic = topic
-        self.holder: Session | None = None
+        self._holder: Session | None = None
+        self._changed = changed
         #: When the holder commanded last.
         self.commanded_at = -math.inf
         self._routes: list[CommandRoute] = []
@@ -75,6 +78,18 @@ class Lease:
         self._stops: OrderedDict[str, _Stops] = OrderedDict()
         #: Whether the last message for ROS was a stop.
         self._is_stopped = False
+
+    @property
+    def holder(self) -> Session | None:
+        """The client that commands alone, if one does."""
+        return self._holder
+
+    @holder.setter
+    def holder(self, holder: Session | None) -> None:
+        has_changed = holder is not self._holder
+        self._holder = holder
+        if has_changed:
+            self._changed()
 
     def add_route(self, route: CommandRoute) -> None:
         """A route with command rules leads to the topic from now on."""
@@ -145,12 +160,14 @@ class Lease:
 class Leases:
     """The leases of all topics that routes lead to; for the loop's thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, changed: Callable[[], object]) -> None:
+        """`changed` is called when a lease has another holder, or none any more."""
+        self._changed = changed
         self._leases: WeakValueDictionary[str, Lease] = WeakValueDictionary()
 
     def of(self, topic: str) -> Lease:
         """The lease of a topic."""
         lease = self._leases.get(topic)
         if lease is None:
-            lease = self._leases[topic] = Lease(topic)
+            lease = self._leases[topic] = Lease(topic, self._changed)
         return lease

@@ -27,7 +27,8 @@ class TopicSettings:
     None means: no limit (`rate`, in Hz, and `bytes_per_second` of payload), taken from the graph
     (`type`, which may contain a `*`, too), taken from the publishers' QoS (`qos`, `retain`). `keep`
     is how many messages of a topic are queued for a busy broker. `fields` are the paths of the
-    fields that go to MQTT, all of them if empty; `limits` are for messages from MQTT.
+    fields that go to MQTT, all of them if empty; `limits` are for messages from MQTT. `quality` and
+    `max_width` are of pictures.
     """
 
     ros: str | tuple[str, ...]
@@ -42,6 +43,8 @@ class TopicSettings:
     compression: Compression = "none"
     fields: tuple[str, ...] = ()
     bytes_per_second: int | None = None
+    quality: int = 80
+    max_width: int | None = None
     limits: InputLimits = field(default_factory=InputLimits)
     #: The command rules for messages to ROS; None for no rules but the types.
     rules: CommandRules | None = None

@@ -10,6 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from time import monotonic
 
 from appliance.broker.message import CountedMessage, Message
@@ -18,12 +19,14 @@ from appliance.ros.mailbox import LARGE, Lane, Mailbox
 from appliance.ros.metrics import FlowCounters, ReceiveCounters
 from appliance.ros.node import Endpoint, QosProfile, RosNode, RosSubscription, TakeBatch
 from appliance.ros.payload.converter import ConversionError
+from appliance.ros.payload.encodings.base import PictureOptions
 from appliance.ros.payload.encodings.registry import ENCODINGS
 from appliance.ros.payload.payloads import packer
 from appliance.ros.qos import mqtt_qos, mqtt_retain, subscription_qos
 from appliance.ros.topics.echo import EchoFilter
 from appliance.ros.topics.flow import Flow, ProblemLog
 from appliance.ros.topics.follower import RoutedTopic, TopicFollower
+from appliance.ros.topics.off_loop import ConversionThreads, Converted, TopicConversions
 from appliance.ros.topics.route import BridgeRoute
 from appliance.ros.topics.transforms import TYPES, StaticTransforms
 
@@ -47,6 +50,8 @@ class Intake:
     #: Whether the publishers retain messages for late subscribers.
     is_latched: bool = False
     echo: EchoFilter | None = None
+    #: Whether that takes so long that it is done on a thread.
+    is_slow: bool = False
 
 
 class RosMessages:
@@ -65,6 +70,7 @@ class RosMessages:
         mailbox: Mailbox,
         counters: ReceiveCounters,
         problems: ProblemLog,
+        threads: ConversionThreads,
     ) -> None:
         """`counters` are the ROS thread's; those of the loop's thread are the lane's."""
         settings = route.settings
@@ -73,6 +79,7 @@ class RosMessages:
         self._mailbox = mailbox
         self._counters = counters
         self._problems = problems
+        self._conversions = TopicConversions(threads)
         self._interval = 1 / settings.rate if settings.rate else 0.0
         self._tolerance = max(0.0, BURST_TOLERANCE - self._interval)
         self._due = 0.0
@@ -93,7 +100,8 @@ class RosMessages:
     def convert(
         self, intake: Intake, cdr: bytes, published_at: int, counters: ReceiveCounters
     ) -> Message | None:
-        """The message for MQTT; None for an echo, for a throttled one and one that has failed.
+        """The message for MQTT; None for an echo, for a throttled one, one that has failed, and one
+        that is being converted on a thread, which then puts it into the mailbox.
 
         Nothing may be logged by ROS here: it would feed /rosout.
         """
@@ -114,11 +122,36 @@ class RosMessages:
                 self._throttled = None if is_admitted else (cdr, now)
             if not is_admitted:
                 return None
+        if intake.is_slow:
+            self._convert_slowly(intake, cdr, published_at, counters)
+            return None
         message = self._message(intake, cdr, published_at, counters)
-        if message is not None and self._bytes_per_second:
+        if message is not None:
+            self._spend(message)
+        return message
+
+    def _spend(self, message: Message) -> None:
+        if self._bytes_per_second:
             with self._admission:
                 self._budget -= len(message.payload)
-        return message
+
+    def _convert_slowly(
+        self, intake: Intake, cdr: bytes, published_at: int, counters: ReceiveCounters
+    ) -> None:
+        """Convert it on a thread, and put it into the mailbox."""
+
+        def take(converted: Converted) -> None:
+            if isinstance(converted, ConversionError):
+                self.fail(f"cannot be converted: {converted}", self._lane.counters)
+            elif isinstance(converted, Exception):
+                self.fail(f"ended in a fault: {converted!r:.200}", self._lane.counters)
+                raise converted
+            else:
+                message = self._made(intake, *converted, published_at)
+                self._spend(message)
+                self._mailbox.put(self._lane, message)
+
+        self._conversions.put(partial(intake.pack, cdr), take, counters)
 
     def fail(self, problem: str, counters: ReceiveCounters) -> None:
         """Count a message that could not be carried, and log that at most once a minute."""
@@ -139,8 +172,21 @@ class RosMessages:
             if self._admit(now, self._counters):
                 self._release(intake, throttled[0])
 
+    def open(self) -> None:
+        """Messages come from now on; after `close`, too."""
+        self._conversions.open()
+
+    def close(self, intake: Intake) -> None:
+        """The flow ends, or what it carries does: send the throttled message although it is early.
+
+        Pictures that are not done are not sent: they would come when the topic belongs to nobody
+        any more, or to another route.
+        """
+        self._conversions.close(self._counters)
+        self.send_throttled(intake)
+
     def send_throttled(self, intake: Intake) -> None:
-        """Send the throttled message although it is early: the flow ends."""
+        """Send the throttled message although it is early: nothing comes after it for now."""
         with self._admission:
             if self._throttled is not None:
                 self._counters.throttled -= 1
@@ -148,6 +194,9 @@ class RosMessages:
 
     def _release(self, intake: Intake, cdr: bytes) -> None:
         self._throttled = None
+        if intake.is_slow:
+            self._convert_slowly(intake, cdr, 0, self._counters)
+            return
         message = self._message(intake, cdr, 0, self._counters)
         if message is not None:
             if self._bytes_per_second:
@@ -162,6 +211,12 @@ class RosMessages:
         except ConversionError as error:
             self.fail(f"cannot be converted: {error}", counters)
             return None
+        return self._made(intake, payload, properties, published_at)
+
+    def _made(
+        self, intake: Intake, payload: bytes, properties: Properties, published_at: int
+    ) -> Message:
+        """The message for MQTT that this has become."""
         known, wire = self._last
         if properties is not known:
             wire = encode_property_list(properties)
@@ -209,13 +264,20 @@ class SubscriptionFollower(TopicFollower):
     absence = "no node publishes it"
 
     def __init__(
-        self, topic: RoutedTopic, mailbox: Mailbox, lane: Lane, on_batch: TakeBatch
+        self,
+        topic: RoutedTopic,
+        mailbox: Mailbox,
+        lane: Lane,
+        on_batch: TakeBatch,
+        threads: ConversionThreads,
     ) -> None:
         """`on_batch`, a method of the flow, takes messages on the loop's thread."""
         super().__init__(topic)
         self.intake = Intake(packer(None, "cdr", "none", []))
         problems = ProblemLog(str(self), topic.log)
-        self.messages = RosMessages(self.route, self.mqtt, lane, mailbox, self.counters, problems)
+        self.messages = RosMessages(
+            self.route, self.mqtt, lane, mailbox, self.counters, problems, threads
+        )
         self._mailbox = mailbox
         self._lane = lane
         # The flow owns this follower. Only the garbage collector would free a cycle of the two, and
@@ -243,13 +305,15 @@ class SubscriptionFollower(TopicFollower):
         settings = self.settings
         converter = None
         encoding = ENCODINGS[settings.encoding]
+        self.messages.open()
         if encoding.serialization is None:
             converter = self._converters.get(type_name, settings.fields)
             encoding.check(converter, to_ros=False)
         about = [("ros-type", type_name)]
         if type_hash is not None:
             about.append(("ros-type-hash", type_hash))
-        pack = packer(converter, settings.encoding, settings.compression, about)
+        picture = PictureOptions(settings.quality, settings.max_width)
+        pack = packer(converter, settings.encoding, settings.compression, about, picture)
         is_latched = mqtt_retain(qos)
         wanted_qos, wanted_retain = settings.qos, settings.retain
         level = mqtt_qos(qos) if wanted_qos is None else wanted_qos
@@ -259,7 +323,9 @@ class SubscriptionFollower(TopicFollower):
             known = self._transforms or StaticTransforms(self._converters.get(type_name))
             self._transforms, merge = known, known.add
         # Messages come as soon as there is a subscription.
-        self.intake = Intake(pack, merge, level, retain, is_latched, self.intake.echo)
+        self.intake = Intake(
+            pack, merge, level, retain, is_latched, self.intake.echo, encoding.is_slow
+        )
         self._subscription = node.subscribe_raw(
             self.ros, type_name, qos, self.on_message, timed=True, on_loop=self._on_batch()
         )
@@ -267,7 +333,7 @@ class SubscriptionFollower(TopicFollower):
 
     def _close(self) -> None:
         self._unsubscribe()
-        self.messages.send_throttled(self.intake)
+        self.messages.close(self.intake)
 
     def _unsubscribe(self) -> None:
         self.bridged = None
@@ -317,21 +383,24 @@ class ToMqtt(Flow):
         topic: RoutedTopic,
         mailbox: Mailbox,
         publish: Callable[[Iterable[tuple[Lane, Message]]], None],
+        threads: ConversionThreads,
     ) -> None:
         """`publish` publishes messages that were received on the loop's thread."""
         counters = FlowCounters()
         self._lane = lane = Lane(topic.route.settings.samples, counters)
-        follower = SubscriptionFollower(topic, mailbox, lane, self.on_batch)
+        follower = SubscriptionFollower(topic, mailbox, lane, self.on_batch, threads)
         super().__init__(follower, topic.log, counters)
         self.follower = follower
         self._messages = follower.messages
         self._mailbox = mailbox
         self._publish = publish
 
-    def total(self) -> FlowCounters:
-        total = super().total()
+    def add_to(self, total: FlowCounters) -> None:
+        super().add_to(total)
         total.dropped += self._lane.dropped
-        return total
+
+    def finish(self) -> None:
+        self._publish([(self._lane, message) for message in self._mailbox.take_of(self._lane)])
 
     def on_batch(self, batch: list[tuple[bytes, int]], lost: int, is_late: bool) -> None:
         """Take a batch of messages and publish it directly.

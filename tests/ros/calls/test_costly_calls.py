@@ -29,7 +29,10 @@ def attack(tmp_path_factory):
 )
 def test_another_client_is_served_meanwhile(attack, name):
     """Without limits and the conversion queue the worst of these stalled it for seconds."""
-    outcome = attack(name, SECONDS)
+    for seconds in (SECONDS, 5 * SECONDS):  # the attackers yield to all else on a busy computer
+        outcome = attack(name, seconds)
+        if outcome.reached:
+            break
     # Few round trips, and a computer that may be busy: 40 of the first took 3.6 s of them.
     problems = costly_calls.problems(outcome, p99=1.0, worst=1.0, least=1)
     assert not problems, (problems, outcome.counts)

@@ -323,6 +323,55 @@ async def test_one_client_at_a_time(harness, caplog):
     assert a.code == 0x87
 
 
+@pytest.mark.parametrize("qos", [1, 2])
+@pytest.mark.parametrize("command", [Driver.drive, Driver.steer])
+async def test_who_is_refused_for_a_lease_is_told_who_holds_it(harness, qos, command):
+    harness.start(CommandRules(exclusive=True, lease=60))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
+    a.drive()
+    command(b, qos=qos)
+    packet = decode(b.wire.written)
+    assert packet.reason_code == 0x87
+    assert "client 'a'" in packet.properties[Property.REASON_STRING]
+    assert "/cmd_vel, and the route is exclusive" in packet.properties[Property.REASON_STRING]
+
+
+async def test_who_commands_is_announced_soon(harness):
+    bridge = harness.start(CommandRules(exclusive=True, lease=60))
+    bridge._meter_timer.cancel()  # which announces every 10 s
+    await until(lambda: harness.bridge.topics())
+
+    def commanding():
+        return [route.get("rules", {}).get("commanding") for route in harness.routes()]
+
+    await until(lambda: commanding() == [None], "the first announcement")
+    a = Driver(harness.broker, "a")
+    a.drive()
+    a.leave()
+    b = Driver(harness.broker, "b")
+    b.drive()
+    await until(lambda: commanding() == ["b"], "who commands")
+    routes = harness.client.payloads("r2d2/_appliance/routes")
+    assert not any(b'"commanding":"a"' in payload for payload in routes), "one of two changes"
+    b.cut()
+    await until(lambda: commanding() == [None], "that nobody does")
+
+
+async def test_who_commands_is_announced_after_a_fault_too(harness, monkeypatch, escaped):
+    harness.start(CommandRules(exclusive=True, lease=60))
+    a = Driver(harness.broker, "a")
+    await until(lambda: harness.routes())
+    faults = harness.broker.faults
+    with monkeypatch.context() as broken:
+        broken.setattr(harness.bridge, "_announce", lambda: 1 / 0)
+        a.drive()
+        await until(lambda: faults.by_entry.get("bridge.announce") == 1, "a fault")
+    a.cut()
+    Driver(harness.broker, "b").drive()
+    await until(lambda: harness.routes()[0]["rules"].get("commanding") == "b", "who commands")
+    escaped.clear()
+
+
 async def test_a_lease_ends_with_the_connection(harness):
     harness.start(CommandRules(exclusive=True, lease=60))
     a, b = Driver(harness.broker, "a", expiry=100), Driver(harness.broker, "b")

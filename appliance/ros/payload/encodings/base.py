@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from appliance.mqtt.codec import Properties
@@ -20,6 +21,15 @@ EncodingName: TypeAlias = str
 Encode: TypeAlias = Callable[[bytes], bytes]
 Decode: TypeAlias = Callable[[bytes], bytes]
 Pack: TypeAlias = Callable[[bytes], tuple[bytes, Properties]]
+
+
+@dataclass(frozen=True, slots=True)
+class PictureOptions:
+    """How pictures are made of images: JPEG's quality, 1 to 95, and the width that they may have,
+    in pixels."""
+
+    quality: int = 80
+    max_width: int | None = None
 
 
 class Encoding(ABC):
@@ -36,6 +46,8 @@ class Encoding(ABC):
     #: Whether payloads are characters: each byte is then work, and `bridge.limits.payload` limits
     #: the size. Other payloads are mostly copied; `broker.limits.packet_size` limits these.
     is_text = False
+    #: Whether a message takes milliseconds: it is converted on a thread, `topics/off_loop.py`.
+    is_slow = False
     #: How ROS serializes the payload, where the payload is ROS's own bytes. No converter is needed
     #: for these on the way to MQTT, so that types without a known definition can go.
     serialization: Serialization | None = None
@@ -44,6 +56,10 @@ class Encoding(ABC):
     def can_call(self) -> bool:
         """Whether calls of services and actions may use it."""
         return self.serialization is not None
+
+    def with_picture(self, options: PictureOptions) -> Encoding:
+        """The same with other options, where these mean something to it."""
+        return self
 
     def check(self, converter: Converter, *, to_ros: bool) -> None:  # noqa: B027 - most take any
         """Raises UnknownTypeError when messages of the type cannot go in this encoding."""

@@ -8,6 +8,7 @@ from appliance.ros.payload.encodings.binary import Binary
 from appliance.ros.payload.encodings.cbor import Cbor
 from appliance.ros.payload.encodings.cdr import Cdr
 from appliance.ros.payload.encodings.json import Json
+from appliance.ros.payload.encodings.picture import JPEG, PNG
 from appliance.ros.payload.encodings.ros1 import Ros1
 from appliance.ros.payload.encodings.text import Text
 
@@ -15,7 +16,8 @@ from appliance.ros.payload.encodings.text import Text
 #: anything of ROS, and lists the names once more, in `appliance.config.values.Encoding`;
 #: tests/ros/payload/test_encodings.py holds the two equal.
 ENCODINGS: dict[EncodingName, Encoding] = {
-    encoding.name: encoding for encoding in (Json(), Cbor(), Text(), Cdr(), Ros1(), Binary())
+    encoding.name: encoding
+    for encoding in (Json(), Cbor(), Text(), Cdr(), Ros1(), Binary(), JPEG, PNG)
 }
 
 #: Those of any value, not of ROS messages alone.
