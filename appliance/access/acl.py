@@ -226,6 +226,12 @@ class Acl:
             return self._decide_receive(identity, topic)
         return self._decide(identity, action, topic)
 
+    def verdict(self, identity: Identity, action: Action, topic: str) -> ActionVerdict:
+        """The decision with its rule; those that were passed over may be missing."""
+        shared = parse_shared(topic) if action is Action.SUBSCRIBE else None
+        rules = self._applied(identity, shared[1] if shared is not None else topic)
+        return self._verdict(identity, action, topic, rules)
+
     def _decide_receive(self, identity: Identity, topic: str) -> Decision:
         received = self._received
         if received.topic != topic:
@@ -242,9 +248,7 @@ class Acl:
         return decision
 
     def _decide(self, identity: Identity, action: Action, topic: str) -> Decision:
-        shared = parse_shared(topic) if action is Action.SUBSCRIBE else None
-        rules = self._applied(identity, shared[1] if shared is not None else topic)
-        verdict = self._verdict(identity, action, topic, rules)
+        verdict = self.verdict(identity, action, topic)
         return Decision(verdict.allowed, verdict.reason)
 
     def allows_some(self, identity: Identity, action: Action, filter: str) -> bool:

@@ -44,6 +44,10 @@ _MAX_DELAYED_REPEATS: Final = 64
 FAILED_LOGINS: Final = 30
 
 _EVERYTHING: Final = Decision(True, "no ACL file: everything is allowed")
+_NO_MANAGEMENT: Final = Decision(False, "no ACL file: nobody may manage the appliance")
+
+#: Topics of calls of the appliance itself begin so.
+_CONTROL: Final = "$CONTROL/"
 
 _STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
 _TOO_MANY: Final = Refusal(ReasonCode.SERVER_BUSY, "too many passwords wait to be checked")
@@ -229,8 +233,14 @@ class FileAccess:
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         """Whether the rules in force let the client do this; see `Acl.decide`."""
         if self._acl is None:
-            return _EVERYTHING
+            is_call = action is Action.PUBLISH and topic.startswith(_CONTROL)
+            return _NO_MANAGEMENT if is_call else _EVERYTHING
         return self._acl.decide(identity, action, topic)
+
+    @property
+    def acl(self) -> Acl | None:
+        """The rules in force; None without an ACL file."""
+        return self._acl
 
     async def authenticate(
         self,

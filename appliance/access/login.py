@@ -97,6 +97,22 @@ class LoginPolicy:
             plugins.admitted(who, connect, address, tls, noted)
         return who
 
+    async def identify(
+        self,
+        username: str | None,
+        password: bytes | None,
+        address: str,
+        tls: ssl.SSLObject | None = None,
+        anonymous: bool | None = None,
+    ) -> Identity | Refusal:
+        """Who somebody is that does not speak MQTT: decided as a CONNECT without a client id.
+
+        Plugins that only watch are not told: for them a login is the beginning of a session.
+        """
+        connect = Connect("", username=username, password=password)
+        who, _ = await self._decide(connect, address, tls, anonymous)
+        return who
+
     async def _decide(
         self, connect: Connect, address: str, tls: ssl.SSLObject | None, anonymous: bool | None
     ) -> tuple[Identity | Refusal, object]:

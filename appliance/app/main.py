@@ -10,7 +10,6 @@ import logging
 import os
 import signal
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import asdict
 from datetime import timedelta
 from functools import partial
 from importlib.metadata import version
@@ -20,10 +19,12 @@ import psutil
 import uvloop
 
 from appliance.access import AccessFileError, FileAccess, LoginPolicy, no_user
-from appliance.app import status, wiring
+from appliance.app import management, status, wiring
 from appliance.app.links import Links
+from appliance.app.own_topics import orphaned_topics
 from appliance.app.reload import Reload, ReloadError, ReloadParts
 from appliance.broker.broker import Broker
+from appliance.broker.histogram import Histogram
 from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.sys_topics import SysTopics
@@ -41,10 +42,11 @@ from appliance.config import (
 from appliance.config.plugins import PluginSettingsError
 from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
+from appliance.management.mqtt_calls import ManagementCalls
 from appliance.net.callbacks import Entries, contained_proxy
 from appliance.net.listeners import Admission, Listeners
 from appliance.ops.audit import Audit, AuditError
-from appliance.ops.control import Control, ControlError
+from appliance.ops.control import Control
 from appliance.ops.crash import CrashReports
 from appliance.ops.sd_notify import Notifier
 from appliance.ops.watchdog import Pulse
@@ -57,6 +59,7 @@ from appliance.ros.ros2.node import Ros2Node
 from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
 
 if TYPE_CHECKING:
+    from appliance.net.http import HttpSite
     from appliance.upstream.uplink import Uplink
 
 log = logging.getLogger(__name__)
@@ -116,6 +119,8 @@ class App:
         self._reload_requested = asyncio.Event()
         self._certificates_due = asyncio.Event()
         self._status: status.Status | None = None
+        #: How late the clock's ticks are, and so everything else on the loop.
+        self._lag = Histogram()
 
     async def start(self) -> None:
         """Start all parts; when one fails, stop those that run.
@@ -182,10 +187,15 @@ class App:
             plugins.logins if plugins is not None else None,
         )
         self._listeners = listeners = Listeners(
-            broker, login.authenticate, login.exchange, limits.build(Admission), tls
+            broker, login.authenticate, login.exchange, limits.build(Admission), tls, self._site
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", InsideLink())
+        for topic in orphaned_topics(broker.retained, settings):
+            self._publish(topic, b"", retain=True)
+        self._pulse = Pulse(broker, listeners.scheduler, self._inside, loop.time)
+        self._tls, self._store = tls, store
+        self._login, self._access = login, access
         self._start_clock(loop)
         # Before the listeners start, and stopped after them: whatever a client is acknowledged is
         # offered to the links.
@@ -215,6 +225,7 @@ class App:
                 self._crashes.previous if self._crashes is not None else None,
             )
         )
+        self._start_management()
         if tls is not None:
             self._run_in_background(partial(self._renew_certificates, tls))
         if settings.file is not None:
@@ -286,6 +297,25 @@ class App:
             # Clients' certificates expire, too.
             await self._listeners.check_certificates()
 
+    def _site(self) -> HttpSite:
+        """What listeners for the web serve. Nothing of it is imported where there is none."""
+        from appliance.app.web import WebParts, site
+
+        return site(
+            WebParts(
+                self.broker,
+                self._tls,
+                self._login,
+                self._pulse,
+                self._listeners,
+                self._store,
+                lambda: self.bridge,
+                lambda: self.upstreams,
+                lambda: self._reload if self._status is not None else None,
+                self._lag,
+            )
+        )
+
     def _start_bridge(self, loop: asyncio.AbstractEventLoop) -> None:
         """Join the ROS bus in the background: MQTT does not wait for ROS."""
         settings = self.settings
@@ -322,6 +352,25 @@ class App:
         self._stack.push_async_callback(self._links.stop)
         self._links.start(self.settings)
 
+    def _start_management(self) -> None:
+        """Answer what the appliance is asked over MQTT, and prepare that for the control socket."""
+        assert self._status is not None
+        self._verbs = management.verbs(
+            management.ManagementParts(
+                self.broker,
+                self._access,
+                self.bridge,
+                self.upstreams,
+                self._status,
+                self._reload,
+                self.reload,
+                self.audit,
+            )
+        )
+        calls = ManagementCalls(self.broker, self._entries, self._verbs)
+        calls.start()
+        self._stack.push_async_callback(calls.stop)
+
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tick every TICK seconds; publish `$SYS` every `broker.sys_interval`."""
         process = psutil.Process()
@@ -342,9 +391,12 @@ class App:
             for topic, payload in sys_topics.update():
                 run("clock.sys_topic", self._publish, topic, payload, True, otherwise=None)
 
+        expected = loop.time() + TICK
+
         def tick() -> float:
-            nonlocal next_sys
+            nonlocal next_sys, expected
             now = loop.time()
+            self._lag.observe(now - expected)
             run("clock.step", check_clock, now, otherwise=None)
             due = run("clock.broker", self.broker.tick, now, otherwise=now + TICK)
             if self._status is not None:
@@ -352,7 +404,8 @@ class App:
             if interval and now >= next_sys:
                 next_sys = now + interval
                 run("clock.sys", publish_sys, otherwise=None)
-            return min(now + TICK, max(due, now + SHORTEST_TICK))
+            expected = min(now + TICK, max(due, now + SHORTEST_TICK))
+            return expected
 
         self._stack.callback(self._entries.every("clock", TICK, tick).cancel)
 
@@ -390,8 +443,7 @@ class App:
             self._on_hangup()
         # Report readiness now that MQTT answers: the bridge joins ROS whenever ROS is there.
         assert self._status is not None
-        pulse = Pulse(self.broker, self._listeners.scheduler, self._inside, loop.time)
-        self._notifier.start(self._entries, self._status.line, pulse.is_alive)
+        self._notifier.start(self._entries, self._status.line, self._pulse.is_alive)
         try:
             await self._stopping.wait()
             log.info("stopping")
@@ -416,49 +468,11 @@ class App:
     def _on_hangup(self) -> None:
         self._listeners.scheduler.in_background(self._try_reload())
 
-    async def _answer_reload(self) -> list[str]:
-        try:
-            changed = await self.reload()
-        except ReloadError as error:
-            raise ControlError(f"nothing was reloaded: {error}") from None
-        if not changed and self._reload.last_change:  # the file watcher was probably faster
-            return [f"nothing has changed since the last reload, {self._reload.last_change}"]
-        return changed
-
-    async def _answer_routes(self) -> list[dict[str, object]]:
-        bridge = self._running_bridge()
-        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
-        return topics + [dict(entry) for entry in bridge.calls.bridged()]
-
-    async def _answer_upstream(self) -> list[dict[str, object]]:
-        return [{**uplink.status().as_json(), "aside": uplink.aside()} for uplink in self.upstreams]
-
-    async def _answer_skipped(self) -> list[dict[str, object]]:
-        return [asdict(skip) for skip in self._running_bridge().skips()]
-
-    def _running_bridge(self) -> Bridge:
-        if self.bridge is None:
-            raise ControlError("there is no bridge (bridge.bus is none)")
-        if self.bridge.problem is not None:
-            raise ControlError(f"there is no bridge to ROS: {self.bridge.problem}")
-        return self.bridge
-
-    async def _answer_status(self) -> dict[str, object]:
-        assert self._status is not None
-        return await self._status.report()
-
     async def _open_control_socket(self) -> None:
         """Answer commands such as `appliance status`, and watch the files for changes."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        commands = {
-            "reload": self._answer_reload,
-            "routes": self._answer_routes,
-            "status": self._answer_status,
-            "skipped": self._answer_skipped,
-            "upstream": self._answer_upstream,
-        }
-        control = Control(settings.control, commands, self.broker.faults)
+        control = Control(settings.control, self._verbs.commands, self.broker.faults)
         try:
             await control.start()
         except OSError as error:

@@ -111,7 +111,7 @@ class Status:
             "errors": self._errors(),
         }
         # In a thread: a revocation list may be long.
-        endings = await asyncio.to_thread(_endings, settings)
+        found = await asyncio.to_thread(endings, settings)
         report["certificates"] = [
             {
                 "what": each.what,
@@ -119,7 +119,7 @@ class Status:
                 "ends": each.ends.isoformat(),
                 "days": each.days,
             }
-            for each in endings
+            for each in found
         ]
         report["warnings"] = list(self._warnings(report))
         return report
@@ -142,10 +142,12 @@ class Status:
     def _clients(self) -> dict[str, Any]:
         broker = self._parts.broker
         known = [session for session in broker.sessions.values() if not session.is_inside]
+        inside = (each for each in broker.sessions.values() if each.is_inside)
+        own = sum(len(each.subscriptions) for each in inside)
         return {
             "clients": len(broker.clients),
             "sessions": len(known),
-            "subscriptions": broker.subscription_count,
+            "subscriptions": broker.subscription_count - own,
             "retained": len(broker.retained),
             "waiting": sum(len(session.queue) + len(session.inflight) for session in known),
         }
@@ -319,7 +321,8 @@ class Status:
             yield f"the last reload took nothing over: {report['reload']['text']}"
 
 
-def _endings(settings: Settings) -> list[certs.Expiry]:
+def endings(settings: Settings) -> list[certs.Expiry]:
+    """When what TLS uses expires; empty without TLS. It reads files: not for the event loop."""
     if not any(listener.tls for listener in settings.broker.listeners):
         return []
     try:

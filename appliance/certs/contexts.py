@@ -22,6 +22,7 @@ from appliance.certs.files import (
     CERTIFICATES_SIZE,
     MALFORMED,
     CertificateError,
+    issued_by,
     load_key,
     out_of_time,
     parse_certificates,
@@ -101,6 +102,28 @@ class LoadedTls:
     def warnings(self, now: datetime | None = None) -> list[str]:
         """What has expired or will soon, each with what to do."""
         return list(_warnings(self, now or datetime.now(timezone.utc)))
+
+    @functools.cached_property
+    def names(self) -> frozenset[str]:
+        """The names in the server's certificate, in lower case."""
+        try:
+            found = self.chain[0].extensions.get_extension_for_class(x509.SubjectAlternativeName)
+        except (x509.ExtensionNotFound, *MALFORMED):
+            return frozenset()
+        return frozenset(name.lower() for name in found.value.get_values_for_type(x509.DNSName))
+
+    @functools.cached_property
+    def authority(self) -> bytes:
+        """What clients have to trust, see `TlsContexts.authority`; read when it is first wanted."""
+        if self.files.ca is None:
+            return b""
+        try:
+            known = parse_certificates(self.files.ca, read(self.files.ca, CERTIFICATES_SIZE))
+        except CertificateError:
+            return b""
+        top = self.chain[-1]
+        issuers = [each for each in known if each == top or issued_by(top, each)]
+        return b"".join(each.public_bytes(Encoding.PEM) for each in issuers)
 
     def plausible(self, now: datetime) -> datetime:
         """The clock's time, or the earliest that it can be: this program was released and the
@@ -264,6 +287,15 @@ class TlsContexts:
     def files(self) -> TlsFiles:
         """The files that are in force."""
         return self._loaded.files
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The names in the server's certificate, in lower case; `*.` stands for one label."""
+        return self._loaded.names
+
+    def authority(self) -> bytes:
+        """Those certificates in `ca` that issued the server's, as PEM; empty when none did."""
+        return self._loaded.authority
 
 
 def server_context(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from appliance.certs.contexts import TlsContexts, TlsFiles, TlsPolicy
 from appliance.config import BrokerSection
 
@@ -40,3 +42,11 @@ def tls_contexts(broker: BrokerSection) -> TlsContexts | None:
     if not policies:
         return None
     return TlsContexts(tls_files(broker), policies, broker.tls.username_from)
+
+
+def authority_directory(broker: BrokerSection) -> Path | None:
+    """The directory of the appliance's own CA; None where the certificates are of another one."""
+    tls = broker.tls
+    directory = tls.ca.parent
+    is_own = tls.ca.name == "ca.crt" and tls.crl in (None, directory / "ca.crl")
+    return directory if is_own else None

@@ -202,13 +202,13 @@ def cert_crl(ca_key: CaKeyOption = None, config: ConfigOption = None) -> None:
 def _directory(config: Path | None) -> Iterator[Path]:
     """The directory of the CA; errors in it, or in the request, become a CommandError."""
     settings = load(config)
-    tls = settings.broker.tls
-    directory = tls.ca.parent
     from appliance.certs import CertificateError
+    from appliance.certs.settings import authority_directory
     from appliance.host.owners import OwnerError, acting_for
 
     try:
-        if tls.ca.name != "ca.crt" or tls.crl not in (None, directory / "ca.crl"):
+        directory = authority_directory(settings.broker)
+        if directory is None:
             raise CommandError(
                 "broker.tls.ca or broker.tls.crl is not a file of this appliance's own authority "
                 "(ca.crt, ca.crl): clients get their certificates where these files come from"

@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from appliance.cli.console import CommandError, ConfigOption, load, read_password
+from appliance.cli.console import (
+    CommandError,
+    ConfigOption,
+    ask_running,
+    load,
+    read_password,
+    warn,
+)
 
 if TYPE_CHECKING:
     from appliance.cli.mqtt_client import ConnectionSettings
 
 _HERE = "localhost"
+
+#: Seconds to wait for an answer of the appliance itself over MQTT.
+_ANSWER_TIMEOUT = 30.0
 
 
 @dataclass(frozen=True)
@@ -141,6 +153,43 @@ class CallTarget(ConnectionOptions):
                 "which robot? Say --robot NAME, or give the MQTT topic: r2d2/arm/grip for /arm/grip"
             )
         return load(self.config).robot
+
+
+@dataclass(frozen=True)
+class ManagedAppliance(ConnectionOptions):
+    """The appliance that is asked: the one of the configuration over its control socket, or one
+    over MQTT where an option says who logs in or where."""
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether it is asked over MQTT."""
+        is_login = self.user is not None or self.cert is not None
+        return is_login or self.port is not None or self.host != _HERE
+
+    @cached_property
+    def _settings(self) -> ConnectionSettings:
+        return self.target()  # it may ask for the password: once
+
+    def ask(self, verb: str, arguments: Mapping[str, Any]) -> Any:
+        """What it answers. Raises CommandError."""
+        if not self.is_remote:
+            answer, mistake = ask_running(self.config, verb, arguments)
+            warn(mistake)
+            return answer
+        from appliance.cli.mqtt_client import ClientError
+        from appliance.cli.rpc_client import RpcClient
+        from appliance.management.topics import topic_of
+
+        try:
+            client = RpcClient(self._settings)
+            try:
+                return json.loads(
+                    client.call(topic_of(verb), json.dumps(arguments).encode(), _ANSWER_TIMEOUT)
+                )
+            finally:
+                client.close()
+        except ClientError as error:
+            raise CommandError(str(error)) from None
 
 
 def _is_configured() -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,7 +52,9 @@ def load(config: Path | None) -> Settings:
         raise CommandError(f"the configuration cannot be used\n{error}") from None
 
 
-def ask_running(config: Path | None, command: str) -> tuple[Any, str]:
+def ask_running(
+    config: Path | None, command: str, arguments: Mapping[str, Any] | None = None
+) -> tuple[Any, str]:
     """What the running appliance answers, and what is wrong with the configuration file: empty when
     nothing is. It goes on with the configuration that it has.
 
@@ -68,7 +70,7 @@ def ask_running(config: Path | None, command: str) -> tuple[Any, str]:
     except CommandError as error:
         broken, settings = error, load_control(config)
     try:
-        answer = ask(settings.control, command)
+        answer = ask(settings.control, command, arguments=arguments)
     except NotRunningError as error:
         raise broken or CommandError(str(error)) from None
     except ControlError as error:

@@ -16,6 +16,7 @@ from appliance.cli.access import acl_app, user_app
 from appliance.cli.calls import call, goal, param_app
 from appliance.cli.certs import cert_app
 from appliance.cli.client import pub, sub
+from appliance.cli.clients import clients_app
 from appliance.cli.console import CommandError
 from appliance.cli.doctor import doctor
 from appliance.cli.fastdds import fastdds
@@ -39,6 +40,7 @@ USING = (pub, sub, call, goal)
 for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)
 GROUPS = {
+    "clients": clients_app,
     "param": param_app,
     "user": user_app,
     "acl": acl_app,

@@ -44,8 +44,7 @@ def _lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "configuration", report["configuration"]
     for number, listener in enumerate(report["listeners"]):
         kind = "TLS" if listener["tls"] else "without TLS"
-        if listener["protocol"] == "websocket":
-            kind += ", WebSocket"
+        kind += {"websocket": ", WebSocket", "web": ", web"}.get(listener["protocol"], "")
         yield "" if number else "listening on", f"{listener['bind']} ({kind})"
     yield (
         "clients",

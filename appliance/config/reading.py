@@ -38,7 +38,7 @@ from appliance.config.settings import (
     TopicRoute,
     UpstreamSection,
 )
-from appliance.config.values import OF_NODE, InListError, ValueEncoding
+from appliance.config.values import OF_NODE, InListError, PictureEncoding, ValueEncoding
 from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument, dotted
 from appliance.host.environment import of_service
 from appliance.mqtt.topics import check_filter, overlaps
@@ -165,6 +165,8 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
         elif route.fields and route.encoding not in (known := get_args(ValueEncoding)):
             problem = f"is for {' and '.join(known)} only, and the encoding is {route.encoding}"
             yield ("bridge", "topics", number, "fields"), problem
+        for key, problem in _cross_check_picture(route):
+            yield ("bridge", "topics", number, key), problem
         if first != number:
             yield ("bridge", "topics", number, "ros"), f"is the same way as bridge.topics[{first}]"
     yield from _cross_check_called(settings.bridge)
@@ -172,6 +174,17 @@ def _cross_check(settings: Settings) -> Iterator[tuple[KeyPath, str]]:
     for number, upstream in enumerate(settings.upstreams):
         for inside, problem in _cross_check_upstream(settings, number, upstream):
             yield ("upstreams", number, *inside), problem
+
+
+def _cross_check_picture(route: TopicRoute) -> Iterator[tuple[str, str]]:
+    """Keys of a route that its encoding does not fit, and what is wrong."""
+    if route.encoding in get_args(PictureEncoding):
+        if route.to != "mqtt":
+            yield "encoding", f"{route.encoding} is for routes to MQTT only"
+    elif "max_width" in route.mqtt_keys:
+        yield "max_width", f"is for jpeg and png only, and the encoding is {route.encoding}"
+    if route.encoding != "jpeg" and "quality" in route.mqtt_keys:
+        yield "quality", f"is for jpeg only, and the encoding is {route.encoding}"
 
 
 def _cross_check_upstream(

@@ -97,7 +97,7 @@ COMMAND_KEYS = (
 )
 """Keys of a route that restrict when a command may reach ROS, and with which values."""
 
-MQTT_KEYS = ("fields", "rate", "bytes_per_second", "qos", "retain")
+MQTT_KEYS = ("fields", "rate", "bytes_per_second", "qos", "retain", "quality", "max_width")
 """Keys of a route that apply to what is published on MQTT, and not to ROS."""
 
 
@@ -129,7 +129,7 @@ class Listener(_Section):
 
     bind: Address
     tls: bool = False
-    protocol: Literal["mqtt", "websocket"] = "mqtt"
+    protocol: Literal["mqtt", "websocket", "web"] = "mqtt"
     client_certificates: ClientCertificates | None = None
     min_version: TlsVersion | None = None
     ciphers: str | None = None
@@ -286,7 +286,7 @@ class BrokerSection(_Section):
         if listener.client_certificates is not None:
             return listener.client_certificates
         # A browser without a certificate that is asked for one gives up the WebSocket.
-        if listener.protocol == "websocket" and self.tls.client_certificates == "optional":
+        if listener.protocol != "mqtt" and self.tls.client_certificates == "optional":
             return "off"
         return self.tls.client_certificates
 
@@ -353,12 +353,15 @@ class Route(_Section):
 class TopicRoute(RouteDefaults, Route):
     """A route of ROS topics: to MQTT, to ROS, or both ways.
 
-    COMMAND_KEYS apply to messages for ROS; times in seconds.
+    COMMAND_KEYS apply to messages for ROS; times in seconds. `quality` is JPEG's, `max_width` in
+    pixels, None for the width of the image.
     """
 
     to: Annotated[Direction, BeforeValidator(check_direction)] = Field(None, validate_default=True)
     type: Annotated[str, AfterValidator(check_ros_type)] | None = None
     fields: list[FieldPath] = []
+    quality: Annotated[int, Field(ge=1, le=95)] = 80
+    max_width: Annotated[int, Field(gt=0)] | None = None
     expire: Annotated[Duration, Field(gt=0)] | None = None
     take_retained: bool = False
     exclusive: bool = False

@@ -391,7 +391,11 @@ FieldPath = Annotated[str, AfterValidator(_check_field)]
 
 #: Nothing of ROS is imported here, and so the encodings that `appliance.ros.payload.encodings` has
 #: are listed once more; tests/ros/payload/test_encodings.py holds the lists equal.
-Encoding = Literal["json", "cbor", "text", "cdr", "ros1", "binary"]
+Encoding = Literal["json", "cbor", "text", "cdr", "ros1", "binary", "jpeg", "png"]
+
+
+#: Those that make pictures of images, for MQTT only.
+PictureEncoding = Literal["jpeg", "png"]
 
 
 #: Those of services and actions.

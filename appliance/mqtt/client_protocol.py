@@ -7,6 +7,10 @@ some brokers answer each message that nobody subscribes to with No matching subs
 
 from __future__ import annotations
 
+import sys
+from array import array
+from collections.abc import Sequence
+
 from appliance.mqtt.codec import V5, V311, PacketType, Property
 from appliance.mqtt.framing import (
     DEFAULT_PAIRS,
@@ -73,6 +77,10 @@ _ACKNOWLEDGEMENTS: dict[int, tuple[int, frozenset[ReasonCode]]] = {
     0x70: (PUBCOMP, Pubcomp.REASONS),
 }
 
+#: The beginning of a PUBACK without reason code, and its size in bytes.
+_PUBACK = b"\x40\x02"
+_PUBACK_SIZE = 4
+
 #: The largest acknowledgement without properties, in bytes: smaller than any packet size limit that
 #: is of use.
 _SHORT = 6
@@ -105,6 +113,35 @@ class ClientProtocol(PacketFramer):
         self._method = announced.get(Property.AUTHENTICATION_METHOD)
         #: Whether the client has sent AUTH with Re-authenticate, and has no answer to it yet.
         self.reauthenticating = False
+
+    def take_pubacks(self, data: bytes) -> tuple[Sequence[int], bytes]:
+        """The packet ids of the PUBACKs without reason code that come first, and the rest of
+        `data`, which is for `receive_data`.
+
+        The events would be the same. But a server that is sent many messages answers with nothing
+        else, and these are taken apart all at once.
+        """
+        if self._have:
+            if self._have >= _PUBACK_SIZE or self._chunks[0][0] != _PUBACK[0]:
+                return (), data
+        elif data[:2] != _PUBACK:
+            return (), data
+        if not self._reading or self.state is not State.CONNECTED:
+            return (), data
+        whole = b"".join([*self._chunks, data]) if self._have else data
+        end = len(whole) // _PUBACK_SIZE * _PUBACK_SIZE
+        firsts, sizes = whole[0:end:_PUBACK_SIZE], whole[1:end:_PUBACK_SIZE]
+        count = end // _PUBACK_SIZE
+        count -= max(len(firsts.lstrip(_PUBACK[:1])), len(sizes.lstrip(_PUBACK[1:])))
+        packet_ids = array("H", whole[: count * _PUBACK_SIZE])
+        if sys.byteorder == "little":
+            packet_ids.byteswap()
+        packet_ids = packet_ids[1::2]
+        if not packet_ids or 0 in packet_ids:
+            return (), data
+        self._chunks.clear()
+        self._have = 0
+        return packet_ids, whole[count * _PUBACK_SIZE :]
 
     def _check(self, first: int, size: int) -> None:
         """Raise ProtocolError if a packet of this type or size is not allowed now."""

@@ -262,13 +262,19 @@ class Pubcomp(_Acknowledgement):
 _QOS_3: Final = "SUBSCRIBE with QoS 3"
 
 
+#: The User Property of SUBSCRIBE for `Subscription.max_rate`.
+MAX_RATE: Final = "max-rate"
+_MAX_RATE: Final = MAX_RATE.encode()
+
+
 @dataclass(slots=True)
 class Subscription:
     """A topic filter and its options (section 3.8.3); 3.1.1 has only the QoS.
 
     `retain_handling`: 0 sends retained messages, 1 only when the subscription is new, 2 never.
     `identifier` is the Subscription Identifier of the SUBSCRIBE that it came in, 0 for none; as a
-    property of the packet it is not encoded here.
+    property of the packet it is not encoded here. Nor is `max_rate`, in messages a second of each
+    topic, 0.0 for any: the user property `max-rate`.
     """
 
     filter: str
@@ -277,6 +283,7 @@ class Subscription:
     retain_as_published: bool = False
     retain_handling: int = 0
     identifier: int = 0
+    max_rate: float = 0.0
 
     def _encode(self, version: int) -> bytes:
         options = check_qos(self.qos)
@@ -339,7 +346,11 @@ class Subscribe:
         packet_id, pos = decode_packet_id(cls.TYPE, body, 0)
         properties = None
         if version == V5:
-            properties, pos = read_properties(body, pos, len(body), cls.TYPE, pairs)
+            start = pos
+            properties, pos = read_properties(body, start, len(body), cls.TYPE, pairs)
+            if pairs is not None and body.find(_MAX_RATE, start, pos) >= 0:
+                # The only User Property that the broker reads; they are not more than `pairs`.
+                properties, pos = decode_properties(body, start, len(body), cls.TYPE)
         subscriptions: list[Subscription] = []
         while pos < len(body):
             subscription, pos = Subscription._decode(body, pos, version)

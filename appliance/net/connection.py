@@ -14,6 +14,7 @@ import os
 import socket
 import ssl
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
 
@@ -30,7 +31,6 @@ from appliance.net import lingering, tls
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.scheduler import PUBLISH_BURST, Scheduler
 from appliance.net.sockets import Probe, peer_status, receive_buffer
-from appliance.net.websocket import WebSocket
 
 #: Bytes of output from which on a client counts as slow, and is sent no more until it has read
 #: them. A healthy client reads less than this in one round of the event loop.
@@ -88,7 +88,8 @@ class ClientConnection:
         self, scheduler: Scheduler, address: str, host: str, anonymous: bool | None = None
     ) -> None:
         self.address = address
-        self._anonymous = anonymous  # whether its listener admits clients without a name
+        #: Whether its listener admits clients without a name; None: as configured for all.
+        self.anonymous = anonymous
         #: The host part of `address`; empty for a Unix socket.
         self.host = host
         #: The account that is charged for what is buffered here; that of strangers until the login.
@@ -152,13 +153,7 @@ class ClientConnection:
         #: A copy of the transport's socket, which outlives it for a lingering close.
         self._connection: socket.socket | None = None
         # One time limit for the whole way to a complete CONNECT, against slow strangers.
-        self._timeout = self._entries.later(
-            "connection.login_timeout",
-            scheduler.connect_timeout,
-            self._too_late,
-            served=self,
-            failed=self.abort,
-        )
+        self._timeout = self._login_timer()
 
     def __str__(self) -> str:
         return str(self._client)
@@ -166,15 +161,21 @@ class ClientConnection:
     # --- the connection ------------------------------------------------------------------------
 
     async def begin(
-        self, connection: socket.socket, context: ssl.SSLContext | None, *, websocket: bool
+        self,
+        connection: socket.socket,
+        context: ssl.SSLContext | None,
+        layer: Callable[[ClientConnection], asyncio.Protocol] | None = None,
     ) -> None:
-        """Take over an accepted connection, with TLS through its handshake."""
+        """Take over an accepted connection, with TLS through its handshake.
+
+        `layer` makes what is between this and TCP or TLS, such as a WebSocket.
+        """
         # asyncio's own server would not report a failed handshake, and the log has to say whose it
         # was and why it failed.
         scheduler = self._scheduler
-        protocol = cast(asyncio.Protocol, WebSocket(self, scheduler) if websocket else self)
         self._accepted = connection
         try:
+            protocol = cast(asyncio.Protocol, self) if layer is None else layer(self)
             if connection.family != socket.AF_UNIX:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 # Detects that the computer of a client without keep alive is gone.
@@ -246,6 +247,24 @@ class ClientConnection:
             self._client.close(ReasonCode.NOT_AUTHORIZED, reason)
         self._broker.flush()
         self._entries.later("connection.revoked", REVOKED_TIMEOUT, self.abort, served=self)
+
+    def _login_timer(self) -> asyncio.TimerHandle:
+        return self._entries.later(
+            "connection.login_timeout",
+            self._scheduler.connect_timeout,
+            self._too_late,
+            served=self,
+            failed=self.abort,
+        )
+
+    def suspend_login_limit(self) -> None:
+        """It may be no MQTT client at all: the layer below limits the time."""
+        self._timeout.cancel()
+
+    def limit_login(self) -> None:
+        """It is an MQTT client: a complete CONNECT has to come in time from now on."""
+        self._timeout.cancel()
+        self._timeout = self._login_timer()
 
     def _too_late(self) -> None:
         timeout = f"{self._scheduler.connect_timeout:g} s"
@@ -721,7 +740,7 @@ class ClientConnection:
     async def _log_in(self, connect: Connect) -> None:
         try:
             self._login_result = await self._scheduler.authenticate(
-                connect, self.address, self._tls, self._anonymous
+                connect, self.address, self._tls, self.anonymous
             )
             self._logging_in = False
             if self._scheduler.is_busy():  # crowds reconnect at once when a network is back

@@ -10,8 +10,9 @@ import socket
 import ssl
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
@@ -27,6 +28,10 @@ from appliance.net.scheduler import (
     Scheduler,
 )
 from appliance.net.sockets import allow_files, listen, listen_on_path
+from appliance.net.websocket import WebSocket
+
+if TYPE_CHECKING:
+    from appliance.net.http import HttpSite
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +96,7 @@ class ListenerSettings:
     host: str
     port: int
     context: Callable[[], ssl.SSLContext] | None
-    protocol: Literal["mqtt", "websocket"] = "mqtt"
+    protocol: Literal["mqtt", "websocket", "web"] = "mqtt"
     path: Path | None = None
     mode: int = 0o660
     anonymous: bool | None = None
@@ -102,8 +107,18 @@ class ListenerSettings:
         return self.host, self.port, self.path
 
 
+#: What is said in the log of a listener that is not for MQTT as it is.
+_KINDS = {"mqtt": "", "websocket": " for WebSocket", "web": " for the web"}
+
+#: Makes what is between a connection and TCP or TLS; None for nothing.
+_Layer: TypeAlias = "Callable[[ClientConnection], asyncio.Protocol] | None"
+
+
 class Listeners:
-    """All listening sockets; `scheduler` has the connections made to them."""
+    """All listening sockets; `scheduler` has the connections made to them.
+
+    `site` makes what listeners for the web serve; it is called when there is the first of them.
+    """
 
     def __init__(
         self,
@@ -112,9 +127,12 @@ class Listeners:
         exchange: BeginExchange,
         admission: Admission,
         certificates: CertificatePolicy | None = None,
+        site: Callable[[], HttpSite] | None = None,
     ) -> None:
         self.broker = broker
         self.admission = admission
+        self._make_site = site
+        self._site: HttpSite | None = None
         self._addresses = _AddressLimits(admission)
         self.scheduler = Scheduler(
             broker,
@@ -175,6 +193,9 @@ class Listeners:
     ) -> None:
         """Put prepared sockets into service and close the others; open connections stay."""
         self.admission = admission
+        if self._site is None and any(listener.protocol == "web" for listener in settings):
+            assert self._make_site is not None
+            self._site = self._make_site()
         self._addresses.use(admission)
         self.scheduler.use(admission.connect_timeout, admission.publish_rate)
         allow_files(admission.connections + OTHER_FILES)
@@ -187,8 +208,7 @@ class Listeners:
             sock.use(listener)
             sock.open()
             if sock not in before:
-                kind = " for WebSocket" if listener.protocol == "websocket" else ""
-                log.info("listening%s on %s", kind, sock)
+                log.info("listening%s on %s", _KINDS[listener.protocol], sock)
 
     async def start(self, settings: list[ListenerSettings]) -> list[tuple[str, int]]:
         """Start to listen; returns the addresses, with the port that was chosen where it was 0.
@@ -229,18 +249,30 @@ class Listeners:
         if listener.context is not None:
             context = listener.context()
             self._handshakes.add(protocol)
-        is_websocket = listener.protocol == "websocket"
-        self.scheduler.in_background(self._begin(protocol, connection, context, is_websocket))
+        layer = self._layer(listener)
+        self.scheduler.in_background(self._begin(protocol, connection, context, layer))
+
+    def _layer(self, listener: ListenerSettings) -> _Layer:
+        if listener.protocol == "websocket":
+            return partial(WebSocket, scheduler=self.scheduler)
+        if listener.protocol == "web":
+            # Not before: it takes time and memory at the start.
+            from appliance.net.http import HttpLayer
+
+            timeout = self.scheduler.connect_timeout
+            assert self._site is not None
+            return partial(HttpLayer, scheduler=self.scheduler, site=self._site, timeout=timeout)
+        return None
 
     async def _begin(
         self,
         protocol: ClientConnection,
         connection: socket.socket,
         context: ssl.SSLContext | None,
-        is_websocket: bool,
+        layer: _Layer,
     ) -> None:
         try:
-            await protocol.begin(connection, context, websocket=is_websocket)
+            await protocol.begin(connection, context, layer)
         finally:
             self._handshakes.discard(protocol)
             if self._stall is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import socket
 import ssl
 from collections import deque
@@ -43,6 +44,11 @@ COST_BETWEEN_CHECKS = 300
 
 #: Seconds by which a client may exceed `limits.publish_rate` in a burst.
 PUBLISH_BURST = 1.0
+
+#: The shortest time until messages are sent that wait because of a max-rate, and the time until
+#: that is tried again after a fault; in seconds.
+SHORTEST_WAIT = 0.001
+AFTER_FAULT = 0.1
 
 #: The most lingering closes at a time; further connections are closed at once.
 LINGERING_CLOSES = 256
@@ -122,6 +128,11 @@ class Scheduler:
         self.authenticate = authenticate
         self.exchange = exchange
         self.entries = Entries(asyncio.get_running_loop(), broker.faults)
+        #: The timer for messages that wait because of a subscription's max-rate, and its time.
+        self._rate_timer: asyncio.TimerHandle | None = None
+        self._rate_time = math.inf
+        broker.rates.clock = self.entries.time
+        broker.rates.wake = self._send_rated_at
         self.use(connect_timeout, publish_rate)
         self.connections: set[ScheduledConnection] = set()
         #: Background tasks of connections: TLS handshakes and logins.
@@ -318,6 +329,31 @@ class Scheduler:
         self._lingering.discard(lingering)
         self._signal_when_all_closed()
 
+    def _send_rated_at(self, when: float) -> None:
+        """Call `_send_rated` at this time at the latest."""
+        if when >= self._rate_time:
+            return
+        if self._rate_timer is not None:
+            self._rate_timer.cancel()
+        self._rate_time = when
+        # uvloop's timers are precise to a millisecond, and would come too early otherwise.
+        when = max(when, self.entries.time() + SHORTEST_WAIT)
+        self._rate_timer = self.entries.at(
+            "scheduler.rates", when, self._send_rated, failed=self._send_rated_again
+        )
+
+    def _send_rated(self) -> None:
+        """Send what has waited because of a subscription's max-rate."""
+        due = self.broker.send_due()
+        self._rate_time = math.inf
+        if due < math.inf:
+            self._send_rated_at(due)
+
+    def _send_rated_again(self) -> None:
+        """A fault came in between."""
+        self._rate_time = math.inf
+        self._send_rated_at(self.entries.time() + AFTER_FAULT)
+
     def _signal_when_all_closed(self) -> None:
         if self._all_closed is not None and not self.connections and not self._lingering:
             self._all_closed.set()
@@ -337,3 +373,6 @@ class Scheduler:
         for lingering in list(self._lingering):
             lingering.end()
         self._spare.close()
+        if self._rate_timer is not None:  # nobody is left who waits
+            self._rate_timer.cancel()
+            self._rate_time = math.inf

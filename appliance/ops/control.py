@@ -1,8 +1,8 @@
 """The control socket: a Unix socket by which commands on the same computer reach the appliance.
 
-A request is one line of JSON, `{"command": "reload"}`, and so is the response: `{"ok": …}` with the
-command's result, or `{"error": "…"}`. The socket's mode, 0600, lets only the appliance's own user
-and root open it.
+A request is one line of JSON, `{"command": "reload"}`, with `"arguments"` where the command has
+some. The response is one too: `{"ok": …}` with the command's result, or `{"error": "…"}`. The
+socket's mode, 0600, lets only the appliance's own user and root open it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from appliance.net.sockets import listen_on_path
 
 log = logging.getLogger(__name__)
 
-#: Runs a command and returns its result; a ControlError is the response when it was not done.
-Command: TypeAlias = Callable[[], Awaitable[object]]
+#: Runs a command with its arguments, as they are in the request, and returns its result; a
+#: ControlError is the response when it was not done.
+Command: TypeAlias = Callable[[object], Awaitable[object]]
 
 #: Limits of a request in bytes, and in seconds to send it: it is one line of a local program.
 LONGEST_REQUEST = 64 * 1024
@@ -96,7 +97,7 @@ class Control:
         if command is None:
             return {"error": f"unknown command; there are {', '.join(sorted(self._commands))}"}
         try:
-            return {"ok": await command()}
+            return {"ok": await command(request.get("arguments", {}))}
         except ControlError as error:
             return {"error": str(error)}
         except Exception as error:
@@ -104,18 +105,21 @@ class Control:
             return {"error": f"a fault in the appliance, see its log: {type(error).__name__}"}
 
 
-def ask(path: Path, command: str, timeout: float = 30.0) -> Any:
+def ask(
+    path: Path, command: str, timeout: float = 30.0, arguments: Mapping[str, Any] | None = None
+) -> Any:
     """Send a command to the appliance that listens there, and return its result.
 
     Raises:
         NotRunningError: no appliance listens there.
         ControlError: it could not do it, or did not respond within `timeout` seconds.
     """
+    request = {"command": command, "arguments": arguments or {}}
     try:
         with _short(path) as short, socket.socket(socket.AF_UNIX) as connection:
             connection.settimeout(timeout)
             connection.connect(str(short))
-            connection.sendall(json.dumps({"command": command}).encode() + b"\n")
+            connection.sendall(json.dumps(request).encode() + b"\n")
             answer = json.loads(b"".join(iter(lambda: connection.recv(65536), b"")))
     except (FileNotFoundError, ConnectionRefusedError):
         raise NotRunningError(

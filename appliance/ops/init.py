@@ -73,11 +73,37 @@ ACCESS = """\
 # Who may read and write which topics, in mosquitto's grammar; what nothing here allows is refused.
 # {{robot}} stands for the robot's name. Ask why with: appliance acl explain USER TOPIC
 
+# Each client reads the answers to its own calls of the appliance.
+pattern read $CONTROL/appliance/v1/+/_reply/%c/#
+
+# A user is in a group by the line that includes it. Each group has the rights of the one before:
+# viewers, drivers, admins.
 user {user}
+include groups/admins.conf
+"""
+
+#: The groups, by their files beside the access rules.
+GROUPS = {
+    "viewers.conf": """\
+# Viewers read everything of the robot, and may ask what they may do.
+
 topic read {{robot}}/#
 topic read $SYS/#
+topic write $CONTROL/appliance/v1/rights/_call/#
+""",
+    "drivers.conf": """\
+# Drivers also command the robot.
+
+include viewers.conf
 topic write {{robot}}/cmd_vel
-{calls}"""
+{calls}""",
+    "admins.conf": """\
+# Admins also manage the appliance: docs/management.md lists what can be called.
+
+include drivers.conf
+topic write $CONTROL/appliance/v1/+/_call/#
+""",
+}
 
 NO_CALLS = """\
 # To call what is bridged takes lines such as these, one for each:
@@ -180,8 +206,8 @@ def initialise(
     yield InitStep(file, made, f"configuration of robot {settings.robot!r}")
     yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
-    rules = ACCESS.format(user=user, calls=calls or NO_CALLS)
-    made = _write_new(settings.broker.acl, rules + (first.user_rules if first else ""))
+    rules = ACCESS.format(user=user) + (first.user_rules if first else "")
+    made = _write_rules(settings.broker.acl, rules, calls or NO_CALLS)
     yield InitStep(settings.broker.acl, made, "access rules")
     if first is not None:
         yield from _link(settings, file, first)
@@ -231,6 +257,15 @@ def _filters(names: Iterable[str]) -> list[str]:
 
 def _filter(part: str) -> str:
     return "+" if "*" in part else part
+
+
+def _write_rules(path: Path, rules: str, calls: str) -> bool:
+    """Write the access rules, and before them the groups, unless there are rules already."""
+    if path.exists():
+        return False
+    for name, text in GROUPS.items():
+        _write_new(path.parent / "groups" / name, text.format(calls=calls))
+    return _write_new(path, rules)
 
 
 def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Iterator[InitStep]:

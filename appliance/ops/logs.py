@@ -28,8 +28,8 @@ VISIBLE_IN_LINES = {code: text for code, text in VISIBLE.items() if code not in 
 # json.dumps escapes C0 itself.
 _VISIBLE_IN_JSON = {code: f"\\u{code:04x}" for code in VISIBLE if code >= 0x7F}
 
-#: The last lines that were logged, for crash reports.
-recent: deque[str] = deque(maxlen=100)
+#: The last lines that were logged, for crash reports and for who manages the appliance.
+recent: deque[str] = deque(maxlen=1000)
 _LONGEST_RECENT = 2000
 
 

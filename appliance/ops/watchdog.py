@@ -1,7 +1,8 @@
-"""The health check behind systemd's watchdog: whether the broker still delivers messages."""
+"""The health check behind systemd's watchdog and `/healthz`: whether the broker still delivers."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable
 
@@ -17,6 +18,12 @@ TOPIC = "$appliance/pulse"
 
 #: Seconds after which the broker's clock has stopped: it ticks once a second.
 CLOCK_PATIENCE = 5.0
+
+#: Seconds that a turn may take to come for who asks at `/healthz`.
+TURN_PATIENCE = 3.0
+
+_CLOCK = "the broker's clock stands still"
+_TURN = "no message has gone through a turn"
 
 
 class Pulse:
@@ -35,6 +42,8 @@ class Pulse:
         self._time = time
         #: Whether a turn is queued, and whether one has come since the last call of `is_alive`.
         self._is_queued = self._has_passed = False
+        #: Set in that turn; all who ask before it wait for the same one.
+        self._turn: asyncio.Event | None = None
         #: What the last call found, empty for nothing; None before the first call.
         self._problem: str | None = None
 
@@ -44,18 +53,41 @@ class Pulse:
         A new problem is logged.
         """
         problem = ""
-        if self._time() - self._broker.ticked_at > CLOCK_PATIENCE:
-            problem = "the broker's clock stands still"
+        if self._is_clock_late():
+            problem = _CLOCK
         elif not self._has_passed:
-            problem = "no message has gone through a turn"
+            problem = _TURN
         if problem and self._problem not in (None, problem):
             log.error("no sign of life for the watchdog: %s", problem)
         self._problem = problem
         self._has_passed = False
+        self._queue()
+        return not problem
+
+    async def problem(self) -> str:
+        """The same, now: a message goes through a turn. Returns what is wrong, empty for nothing.
+
+        It does not change what `is_alive` finds.
+        """
+        if self._is_clock_late():
+            return _CLOCK
+        if self._turn is None:
+            self._turn = asyncio.Event()
+        turn = self._turn
+        self._queue()
+        try:
+            await asyncio.wait_for(turn.wait(), TURN_PATIENCE)
+        except asyncio.TimeoutError:
+            return _TURN
+        return ""
+
+    def _is_clock_late(self) -> bool:
+        return self._time() - self._broker.ticked_at > CLOCK_PATIENCE
+
+    def _queue(self) -> None:
         if not self._is_queued:
             self._is_queued = True
             self._scheduler.queue_turn(self)
-        return not problem
 
     def take_turn(self) -> None:
         """See `scheduler`: a turn as that of any client with work to do."""
@@ -63,6 +95,9 @@ class Pulse:
         self._broker.publish(Message(TOPIC, b""), self._session)
         self._broker.flush()
         self._has_passed = True
+        if self._turn is not None:
+            self._turn.set()
+            self._turn = None
 
     def fault(self, entry: str, error: Exception) -> None:
         """Count the fault; the next turn shows whether it was the only one."""

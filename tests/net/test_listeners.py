@@ -619,7 +619,7 @@ broker:
         ("{bind: 'unix:x', mode: '0777'}", "mode: must be 0600, 0660 or 0666"),
         ("{bind: 'unix:x', mode: true}", "mode: must be 0600, 0660 or 0666"),
         ("{bind: 'unix:'}", 'bind: must be "host:port"'),
-        ("{bind: ':1', protocol: ws}", "protocol: must be mqtt or websocket"),
+        ("{bind: ':1', protocol: ws}", "protocol: must be mqtt, websocket or web"),
         ("{bind: 'unix:x'}, {bind: 'unix:./x'}", "bind: broker.listeners[0] listens there already"),
     ],
 )

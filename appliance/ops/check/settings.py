@@ -62,6 +62,10 @@ def _listeners(settings: Settings) -> Iterator[Finding]:
             scheme = "wss" if listener.tls else "ws"
             text = f"for WebSocket only ({scheme}://HOST:PORT/mqtt): plain MQTT is refused here"
             yield Finding("ok", subject, text)
+        elif listener.protocol == "web":
+            scheme = "https" if listener.tls else "http"
+            text = f"for the web ({scheme}://HOST:PORT/, and MQTT over WebSocket at /mqtt)"
+            yield Finding("ok", subject, text)
         if listener.tls:
             yield Finding("ok", subject, "TLS")
         elif listener.bind.loopback:

@@ -1,0 +1,117 @@
+"""All verbs of the appliance, and those that ask its parts how they are."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from appliance.access import FileAccess
+from appliance.app.reload import Reload, ReloadError
+from appliance.app.status import Status
+from appliance.broker.broker import Broker
+from appliance.certs.settings import authority_directory
+from appliance.management.certificates import CertificateVerbs
+from appliance.management.clients import ClientVerbs
+from appliance.management.examination import DoctorVerb
+from appliance.management.records import RecordVerbs
+from appliance.management.rights import RightsVerbs
+from appliance.management.users import UserVerbs
+from appliance.management.verbs import Arguments, Caller, Verb, Verbs
+from appliance.ops.audit import Audit
+from appliance.ros.bridge import Bridge
+from appliance.ros.calls.dispatcher import CallError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from appliance.upstream.uplink import Uplink
+
+#: Seconds that a reload has: with many users and rules it reads long files.
+RELOAD_TIMEOUT = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class ManagementParts:
+    """The parts that the verbs are about. `reload` applies the files as they are now."""
+
+    broker: Broker
+    access: FileAccess
+    bridge: Bridge | None
+    upstreams: Sequence[Uplink]
+    status: Status
+    outcome: Reload
+    reload: Callable[[], Awaitable[list[str]]]
+    audit: Audit | None
+
+
+def verbs(parts: ManagementParts) -> Verbs:
+    """All of them."""
+    reload = parts.outcome
+
+    async def take_over() -> None:
+        try:
+            await parts.reload()
+        except ReloadError as error:
+            raise CallError("failed", f"it is in the file, and not in force: {error}") from None
+
+    found = [
+        *ApplianceVerbs(parts).verbs(),
+        *ClientVerbs(parts.broker).verbs(),
+        *RightsVerbs(parts.broker, parts.access).verbs(),
+        *UserVerbs(parts.access, take_over).verbs(),
+        *CertificateVerbs(lambda: authority_directory(reload.settings.broker), take_over).verbs(),
+        # Its path changes with a restart only.
+        *RecordVerbs(reload.settings.broker.audit.path).verbs(),
+    ]
+    if reload.settings.file is not None:
+        found += DoctorVerb(reload.settings.file).verbs()
+    return Verbs(found, parts.audit.changed if parts.audit is not None else None)
+
+
+class ApplianceVerbs:
+    """The verbs about the appliance as a whole."""
+
+    def __init__(self, parts: ManagementParts) -> None:
+        self._parts = parts
+
+    def verbs(self) -> Iterator[Verb[Any]]:
+        """All of them."""
+        yield Verb("status", Arguments, self._status)
+        yield Verb("routes", Arguments, self._routes)
+        yield Verb("skipped", Arguments, self._skipped)
+        yield Verb("upstream", Arguments, self._upstream)
+        yield Verb("reload", Arguments, self._reload, RELOAD_TIMEOUT, changes="reload")
+
+    async def _status(self, caller: Caller, _: Arguments) -> dict[str, object]:
+        return await self._parts.status.report()
+
+    async def _routes(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
+        bridge = self._running_bridge()
+        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
+        return topics + [dict(entry) for entry in bridge.calls.bridged()]
+
+    async def _skipped(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
+        return [asdict(skip) for skip in self._running_bridge().skips()]
+
+    async def _upstream(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
+        uplinks = self._parts.upstreams
+        return [{**uplink.status().as_json(), "aside": uplink.aside()} for uplink in uplinks]
+
+    async def _reload(self, caller: Caller, _: Arguments) -> list[str]:
+        try:
+            changed = await self._parts.reload()
+        except ReloadError as error:
+            raise CallError("rejected", f"nothing was reloaded: {error}") from None
+        last = self._parts.outcome.last_change
+        if not changed and last:  # the file watcher was probably faster
+            return [f"nothing has changed since the last reload, {last}"]
+        return changed
+
+    def _running_bridge(self) -> Bridge:
+        bridge = self._parts.bridge
+        if bridge is None:
+            raise CallError("unavailable", "there is no bridge (bridge.bus is none)")
+        if bridge.problem is not None:
+            raise CallError("unavailable", f"there is no bridge to ROS: {bridge.problem}")
+        return bridge

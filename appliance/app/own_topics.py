@@ -1,0 +1,28 @@
+"""What the appliance says of itself, retained below `{robot}/_appliance/`, after a restart."""
+
+from __future__ import annotations
+
+from appliance.broker.retained import RetainedMessages
+from appliance.config import Settings
+
+
+def orphaned_topics(retained: RetainedMessages, settings: Settings) -> list[str]:
+    """Topics at which an earlier run has said what no part of this one would take back.
+
+    They are of links that were removed meanwhile, of a bridge where there is none any more, and of
+    a robot that had another name. What a user has retained at such a topic stays.
+    """
+    own = f"{settings.robot}/_appliance/"
+    links = f"{own}upstream/"
+    said = {f"{own}state", *(links + link.name for link in settings.upstreams)}
+    has_bridge = settings.bridge.bus != "none"
+
+    def is_said(topic: str) -> bool:
+        is_of_bridge = topic.startswith(own) and not topic.startswith(links)
+        return topic in said or (has_bridge and is_of_bridge)
+
+    return [
+        topic
+        for topic, _ in retained.find("+/_appliance/#")
+        if retained.owner(topic).is_inside and not is_said(topic)
+    ]

@@ -1,0 +1,99 @@
+"""The parts of the appliance that listeners for the web serve; imported only where there is one."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+from appliance.access import LoginPolicy, no_user
+from appliance.app.metrics import Metrics, MetricsParts
+from appliance.app.reload import Reload
+from appliance.broker.broker import Broker
+from appliance.broker.histogram import Histogram
+from appliance.certs import TlsContexts
+from appliance.net.listeners import Listeners
+from appliance.ops.watchdog import Pulse
+from appliance.ros.bridge import Bridge
+from appliance.store import SessionStore
+from appliance.web.authority import ca_certificate
+from appliance.web.console import Console
+from appliance.web.health import PartState, healthz, readyz
+from appliance.web.login import WebLogin
+from appliance.web.metrics import metrics
+from appliance.web.site import WebSite
+
+if TYPE_CHECKING:
+    from appliance.upstream.uplink import Uplink
+
+#: Each of its addresses is this computer.
+LOCALHOST = "localhost"
+
+
+@dataclass(frozen=True, slots=True)
+class WebParts:
+    """What the web is about. The bridge, the links and reloads begin after the listeners."""
+
+    broker: Broker
+    tls: TlsContexts | None
+    login: LoginPolicy
+    pulse: Pulse
+    listeners: Listeners
+    store: SessionStore
+    bridge: Callable[[], Bridge | None]
+    upstreams: Callable[[], Sequence[Uplink]]
+    reload: Callable[[], Reload | None]
+    lag: Histogram
+
+
+def site(parts: WebParts) -> WebSite:
+    """All that is served."""
+    tls = parts.tls
+    login = WebLogin(parts.broker, parts.login, asyncio.get_running_loop().time)
+    figures = Metrics(
+        MetricsParts(
+            version("ros-mqtt-appliance"),
+            parts.broker,
+            parts.store,
+            parts.bridge,
+            parts.upstreams,
+            parts.reload,
+            parts.lag,
+        )
+    )
+    return WebSite(
+        {
+            **Console().resources,
+            "/healthz": healthz(parts.pulse.problem),
+            "/readyz": readyz(lambda: _states(parts)),
+            "/ca.crt": ca_certificate(tls.authority if tls is not None else bytes),
+            "/metrics": metrics(login, figures.render),
+        },
+        _names(tls),
+        tls.username if tls is not None else no_user,
+    )
+
+
+def _names(tls: TlsContexts | None) -> Callable[[], frozenset[str]]:
+    """The names by which this server is known: of its certificate, or else of the computer."""
+    if tls is not None:
+        return lambda: tls.names | {LOCALHOST}
+    host = socket.gethostname().lower()
+    known = frozenset((LOCALHOST, host, f"{host.partition('.')[0]}.local"))
+    return lambda: known
+
+
+def _states(parts: WebParts) -> dict[str, PartState]:
+    def state(is_ready: bool) -> PartState:
+        return PartState.READY if is_ready else PartState.NOT_READY
+
+    off, store, bridge, upstreams = PartState.OFF, parts.store, parts.bridge(), parts.upstreams()
+    return {
+        "mqtt": state(bool(parts.listeners.addresses)),
+        "store": off if store.path is None else state(not store.failing),
+        "ros": off if bridge is None else state(bridge.state == "joined"),
+        "upstream": state(all(each.is_connected for each in upstreams)) if upstreams else off,
+    }

@@ -1,0 +1,545 @@
+"""HTTP/1.1 (RFC 9112) of a listener for the web: a layer of a connection, with h11's protocol.
+
+What is asked for is answered by an `HttpSite`. A request for a WebSocket on `/mqtt` ends this
+layer: the connection is that of an MQTT client from there on, as on a listener for WebSocket.
+
+A request is taken when the one before it was answered and its answer was read; until then nothing
+is read from the client. Requests have no body. An answer that is ready waits for a turn if the
+round is used up: what many requests wait for may come for all of them at once.
+
+A connection is a guest of its listener for all its life: it makes room when there are too many, see
+`Listeners`.
+
+h11 is imported here and nowhere else, and this module only where a listener for the web is wanted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import Awaitable, Coroutine, Iterable
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from http import HTTPStatus
+from typing import Any, Final, Protocol, cast
+
+import h11
+
+from appliance.broker.accounts import Account
+from appliance.net.callbacks import contained, contained_made
+from appliance.net.layers import LayerScheduler
+from appliance.net.websocket import HEAD_COST, HEAD_LIMIT, PATH, WebSocket, WebSocketHandler
+
+Headers = tuple[tuple[str, str], ...]
+
+#: On every answer. Nothing is loaded from elsewhere, framed, sniffed, or read by another site's
+#: pages. No HSTS: where the CA is our own, it would take the browser's "proceed" away.
+SECURITY_HEADERS: Final[Headers] = (
+    (
+        "Content-Security-Policy",
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "worker-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    ),
+    ("X-Content-Type-Options", "nosniff"),
+    ("Referrer-Policy", "no-referrer"),
+    ("Cross-Origin-Opener-Policy", "same-origin"),
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+)
+
+#: Seconds that a connection is kept for another request: Prometheus asks every 15 s to 60 s.
+IDLE_TIMEOUT = 75.0
+
+#: A chunk of at most this many bytes is small, and may be taken although others wait for a turn.
+SMALL_CHUNK = 2048
+
+#: The cost of an answer, see `Counters.cost`: its head. And the bytes of its body for a unit more.
+ANSWER_COST = 50
+BODY_PER_COST_UNIT = 16 * 1024
+
+#: Empty lines that a client may send before a request (RFC 9112, section 2.2), in bytes.
+EMPTY_LINES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class HttpRequest:
+    """A request: `path` as it was sent, without the query; names of `headers` in lower case.
+
+    `address` is the client's with its port, `peer` without (empty for a Unix socket), and
+    `anonymous` is whether its listener admits clients without a user name, None for as configured.
+    """
+
+    method: str
+    path: str
+    query: str
+    #: The authority that it is meant for: the Host header, or that of the target.
+    host: str
+    #: With a password, perhaps.
+    headers: Headers = field(repr=False)
+    address: str
+    peer: str
+    tls: ssl.SSLObject | None
+    anonymous: bool | None
+
+    def get(self, name: str) -> str | None:
+        """The header of that name in lower case; None if there is none, or more than one."""
+        found = [value for key, value in self.headers if key == name]
+        return found[0] if len(found) == 1 else None
+
+
+@dataclass(frozen=True, slots=True)
+class HttpResponse:
+    """An answer; SECURITY_HEADERS, the length and the date are added. HEAD leaves the body out."""
+
+    status: int
+    body: bytes = b""
+    content_type: str = "text/plain; charset=utf-8"
+    headers: Headers = ()
+
+
+def text(status: int, words: str, *headers: tuple[str, str]) -> HttpResponse:
+    """An answer in words."""
+    return HttpResponse(status, f"{words}\n".encode(), headers=headers)
+
+
+class HttpSite(Protocol):
+    """What is there for HTTP."""
+
+    def respond(self, request: HttpRequest) -> Awaitable[HttpResponse]:
+        """Answer a request; an exception ends the connection."""
+
+    def objection(self, request: HttpRequest) -> HttpResponse | None:
+        """Why the request may not become a WebSocket; None if it may."""
+
+
+class HttpHandler(WebSocketHandler, Protocol):
+    """The layer above: a connection that may become an MQTT client's."""
+
+    address: str
+    host: str
+    anonymous: bool | None
+
+    def suspend_login_limit(self) -> None:
+        """The layer below limits the time."""
+
+    def limit_login(self) -> None:
+        """A complete CONNECT has to come in time from now on."""
+
+
+class HttpScheduler(LayerScheduler, Protocol):
+    """The scheduler as this layer sees it."""
+
+    def in_background(self, work: Coroutine[object, object, None]) -> None:
+        """Run it as a task; it must not raise."""
+
+
+class HttpLayer(asyncio.Transport, asyncio.Protocol):
+    """A protocol for the transport below, and the transport of the `protocol` above.
+
+    `timeout` is in seconds: that long a request may take to come, to be answered, and its answer to
+    be read; each for itself.
+    """
+
+    def __init__(
+        self, protocol: HttpHandler, scheduler: HttpScheduler, site: HttpSite, timeout: float
+    ) -> None:
+        super().__init__()
+        self._protocol = protocol
+        self._scheduler = scheduler
+        self._site = site
+        self._timeout = timeout
+        self._http = h11.Connection(h11.SERVER, max_incomplete_event_size=HEAD_LIMIT)
+        #: Of the request that is answered; empty for what could not be read.
+        self._method = ""
+        #: What was received and not taken yet, and from where on the end of a head is looked for.
+        self._received = bytearray()
+        self._searched = 0
+        #: Bytes of empty lines before the request.
+        self._empty = 0
+        #: Nothing has come behind the last answer yet.
+        self._is_idle = False
+        #: Bytes that TLS below buffers, and those of `_received` that were reported.
+        self._below = 0
+        self._buffered = 0
+        self._queued = False
+        #: The answer that waits for a turn.
+        self._response: HttpResponse | None = None
+        #: A request is being answered, or its answer is not read yet.
+        self._busy = False
+        self._writing = True
+        self._paused = False
+        #: The client sends nothing more.
+        self._hung_up = False
+        #: Another layer has taken over.
+        self._replaced = False
+        self._deadline: asyncio.TimerHandle | None = None
+
+    def fault(self, entry: str, error: Exception) -> None:
+        """End this connection because an unexpected exception escaped while it was served."""
+        self._protocol.fault(entry, error)
+
+    # --- towards the transport -----------------------------------------------------------------
+
+    @contained_made("http.made")
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """The connection is there, its TLS handshake done."""
+        self._transport = cast(asyncio.Transport, transport)
+        self._protocol.suspend_login_limit()
+        self._protocol.connection_made(self)
+        self._limit(self._timeout)
+
+    @contained("http.chunk")
+    def data_received(self, data: bytes) -> None:
+        """Take the request if it is complete, now or in a turn."""
+        if self._transport.is_closing():
+            return
+        if self._is_idle:
+            self._is_idle = False
+            self._limit(self._timeout)
+        self._received += data
+        if not self._busy:
+            is_small = len(self._received) <= SMALL_CHUNK
+            if self._queued or self._scheduler.must_wait(self._protocol, is_small=is_small):
+                self._take_later()
+            else:
+                self._take()
+        self._count_received()
+
+    def _count_received(self) -> None:
+        """Report the memory of what was not taken yet."""
+        size = 0 if self._replaced else len(self._received)
+        if size != self._buffered:
+            self._buffered = size
+            self._protocol.count_buffered(self._below + size)
+
+    def _limit(self, seconds: float) -> None:
+        """Restart the time limit."""
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._deadline = self._scheduler.entries.later(
+            "http.timeout", seconds, self._too_late, served=self._protocol, failed=self.abort
+        )
+
+    def _too_late(self) -> None:
+        if self._transport.is_closing():
+            return
+        if self._busy or not self._writing:
+            what = "ready" if self._http.our_state is h11.SEND_RESPONSE else "read"
+            self._protocol.log_refusal("no HTTP answer", f"none was {what} in {self._timeout:g} s")
+            self._protocol.abort()
+        elif self._received:
+            self._refuse(408, f"no complete request within {self._timeout:g} s")
+        else:
+            self._protocol.close()
+
+    def _take(self) -> None:
+        """Take a request from what was received, if it is complete."""
+        received = self._received
+        empty = len(received) - len(received.lstrip(b"\r\n"))
+        if empty:
+            del received[:empty]
+            self._searched = 0
+            self._empty += empty
+        end = received.find(b"\r\n\r\n", self._searched) + 4
+        self._searched = max(0, len(received) - 3)
+        if self._empty > EMPTY_LINES or (received and not received[:1].isupper()):
+            what = "TLS, which this listener has not" if received[:1] == b"\x16" else "not HTTP"
+            self._protocol.log_refusal("no HTTP connection", f"what it sent is {what}")
+            self._protocol.close()
+        elif end > HEAD_LIMIT or (end < 4 and len(received) > HEAD_LIMIT):
+            self._refuse(431, f"the request's head is longer than {HEAD_LIMIT} bytes")
+        elif end >= 4:
+            head = bytes(received[:end])
+            del received[:end]
+            self._searched = self._empty = 0
+            self._scheduler.count_cost(HEAD_COST, self._protocol)
+            self._receive_head(head)
+        elif self._hung_up:
+            self._protocol.close()
+        else:
+            self._read_on()
+
+    def _take_later(self) -> None:
+        """Take the request in a later turn, when the others had theirs."""
+        self._pause()
+        if not self._queued:
+            self._queued = True
+            self._scheduler.queue_turn(self)
+
+    def take_turn(self) -> None:
+        """Continue: the others have had their turn."""
+        self._queued = False
+        response, self._response = self._response, None
+        if response is not None:
+            self._answer_counted(response)
+        elif not (self._busy or self._replaced or self._transport.is_closing()):
+            self._take()
+            self._count_received()
+
+    def _pause(self) -> None:
+        if not self._paused:
+            self._paused = True
+            self._protocol.input_paused()
+            self._transport.pause_reading()
+
+    def _read_on(self) -> None:
+        if self._paused:
+            self._paused = False
+            self._protocol.input_resumed()
+            self._transport.resume_reading()
+
+    # --- requests and answers ------------------------------------------------------------------
+
+    def _receive_head(self, head: bytes) -> None:
+        http = self._http
+        self._method = ""
+        http.receive_data(head)
+        try:
+            event = http.next_event()
+            following = http.next_event()
+        except h11.RemoteProtocolError as error:
+            self._refuse(error.error_status_hint, str(error))
+            return
+        if type(event) is not h11.Request:
+            self._refuse(400, "not a request")
+            return
+        self._method = event.method.decode("ascii")
+        if not event.http_version.startswith(b"1."):
+            self._refuse(505, "HTTP/1.1 is spoken here")
+        elif type(following) is not h11.EndOfMessage or http.trailing_data[0]:
+            # Its length would have to be believed before anybody has wanted it.
+            self._refuse(413, "requests have no body here")
+        else:
+            request = self._request(event)
+            if request is None:
+                self._refuse(400, "not a request for a path of this server")
+            elif _is_upgrade(request):
+                self._upgrade(request, head)
+            else:
+                self._begin(request)
+
+    def _request(self, event: h11.Request) -> HttpRequest | None:
+        """The request; None if it is not for a path."""
+        # h11 has checked that the target is of printable ASCII, and that there is one Host.
+        target = event.target.decode("ascii")
+        headers = [(bytes(k).decode("ascii"), bytes(v).decode("latin-1")) for k, v in event.headers]
+        host = next((value for name, value in headers if name == "host"), "")
+        scheme, mark, rest = target.partition("://")
+        if mark and scheme.lower() in ("http", "https"):  # RFC 9112, section 3.2.2
+            host, slash, path = rest.partition("/")
+            target = slash + path or "/"
+        if not target.startswith("/"):
+            return None
+        path, _, query = target.partition("?")
+        protocol = self._protocol
+        return HttpRequest(
+            self._method,
+            path,
+            query,
+            host,
+            tuple(headers),
+            protocol.address,
+            protocol.host,
+            cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object")),
+            protocol.anonymous,
+        )
+
+    def _begin(self, request: HttpRequest) -> None:
+        """Have the request answered; nothing is read meanwhile."""
+        self._busy = True
+        self._pause()
+        self._limit(self._timeout)
+        self._scheduler.in_background(self._respond(request))
+
+    async def _respond(self, request: HttpRequest) -> None:
+        try:
+            response = await self._site.respond(request)
+            # As a small chunk, not behind all others: `/healthz` answers also without any turns.
+            if self._scheduler.must_wait(self._protocol, is_small=True):
+                self._response = response
+                self._queued = True
+                self._scheduler.queue_turn(self)
+            else:
+                self._answer_counted(response)
+        except Exception as error:
+            self.fault("http.respond", error)
+
+    def _answer_counted(self, response: HttpResponse) -> None:
+        """Send the answer, and count what that costs, unless the client has gone."""
+        if not self._transport.is_closing():
+            cost = ANSWER_COST + len(response.body) // BODY_PER_COST_UNIT
+            self._scheduler.count_cost(cost, self._protocol)
+            self._answer(response)
+
+    def _answer(self, response: HttpResponse, *more: tuple[str, str]) -> None:
+        """Send the answer; go on when it was read."""
+        http = self._http
+        headers: Iterable[tuple[str, str]] = (
+            ("Date", formatdate(usegmt=True)),
+            ("Content-Type", response.content_type),
+            ("Content-Length", str(len(response.body))),
+            *SECURITY_HEADERS,
+            *response.headers,
+            *more,
+        )
+        names = {name.lower() for name, _ in response.headers}
+        caching = () if "cache-control" in names else (("Cache-Control", "no-store"),)
+        head = h11.Response(
+            status_code=response.status,
+            headers=[*headers, *caching],
+            reason=HTTPStatus(response.status).phrase,
+        )
+        parts = [http.send(head)]
+        if self._method != "HEAD":
+            parts.append(http.send(h11.Data(data=response.body)))
+        parts.append(http.send(h11.EndOfMessage()))
+        self._limit(self._timeout)
+        self._busy = True
+        self._pause()
+        self._transport.write(b"".join(part for part in parts if part))
+        if http.our_state is not h11.DONE:
+            self._protocol.close()
+        elif self._writing:
+            self._next()
+
+    def _next(self) -> None:
+        """The answer was taken by the network: go on with the next request."""
+        if not self._busy or self._transport.is_closing():
+            return
+        self._busy = False
+        self._http.start_next_cycle()
+        if self._received:
+            self._limit(self._timeout)
+            self._take_later()
+        elif self._hung_up:
+            self._protocol.close()
+        else:
+            self._is_idle = True
+            self._limit(IDLE_TIMEOUT)
+            self._read_on()
+
+    def _refuse(self, status: int, reason: str) -> None:
+        """Answer what is not a request that can be served, and close."""
+        self._protocol.log_refusal("no HTTP request", reason)
+        if self._http.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            self._answer(text(status, reason), ("Connection", "close"))
+        self._protocol.close()
+
+    def _upgrade(self, request: HttpRequest, head: bytes) -> None:
+        """Hand the connection to a WebSocket, which answers the request; or refuse that."""
+        response = self._site.objection(request)
+        if response is not None:
+            self._answer(response)
+            return
+        rest = bytes(self._received)
+        self._replaced = True
+        self._received.clear()
+        self._count_received()
+        if self._deadline is not None:
+            self._deadline.cancel()
+        protocol, transport = self._protocol, self._transport
+        protocol.limit_login()
+        self._read_on()
+        websocket = WebSocket(protocol, self._scheduler)
+        transport.set_protocol(websocket)
+        websocket.connection_made(transport)
+        websocket.count_buffered(self._below)
+        websocket.data_received(head + rest)
+
+    # --- what the transport says ---------------------------------------------------------------
+
+    @property
+    def account(self) -> Account:
+        """The account that is charged for what TLS does below."""
+        return self._protocol.account
+
+    def count_buffered(self, size: int) -> None:
+        """TLS below buffers so many bytes."""
+        self._below = size
+        self._protocol.count_buffered(size + self._buffered)
+
+    def input_paused(self) -> None:
+        """Received bytes wait in TLS."""
+        self._protocol.input_paused()
+
+    def input_resumed(self) -> None:
+        """Nothing waits in TLS any more."""
+        self._protocol.input_resumed()
+
+    def partial_record(self, part: bool) -> None:
+        """Whether TLS buffers the beginning of a record."""
+        self._protocol.partial_record(part)
+
+    @contained("http.pause")
+    def pause_writing(self) -> None:
+        """The client reads more slowly than it is written to."""
+        self._writing = False
+        self._protocol.pause_writing()
+
+    @contained("http.resume")
+    def resume_writing(self) -> None:
+        """It has read most of the answer."""
+        self._writing = True
+        self._protocol.resume_writing()
+        if self._http.our_state is h11.DONE:
+            self._next()
+
+    @contained("http.eof")
+    def eof_received(self) -> bool | None:
+        """The client sends nothing more; what it has asked for is answered nevertheless."""
+        self._hung_up = True
+        if self._busy or self._queued:
+            return True
+        self._protocol.eof_received()
+        return False
+
+    @contained("http.lost")
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection has ended, from either side."""
+        if self._deadline is not None:
+            self._deadline.cancel()
+        self._received.clear()
+        self._protocol.connection_lost(exc)
+
+    # --- the transport of the protocol above ---------------------------------------------------
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """MQTT is not spoken here yet: nothing is to be written."""
+
+    def close(self) -> None:
+        """Close when what was written is read."""
+        self._transport.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._transport.abort()
+
+    def is_closing(self) -> bool:
+        """Whether the connection is closed, or closing."""
+        return self._transport.is_closing()
+
+    def pause_reading(self) -> None:
+        """Take nothing more: the connection closes."""
+        self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """The protocol above need not wait; this layer may have to."""
+        if not self._paused:
+            self._transport.resume_reading()
+
+    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+        """Those of the transport below."""
+        self._transport.set_write_buffer_limits(high, low)
+
+    def get_write_buffer_size(self) -> int:
+        """Bytes that wait in the transport below."""
+        return self._transport.get_write_buffer_size()
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """What the transport below knows."""
+        return self._transport.get_extra_info(name, default)
+
+
+def _is_upgrade(request: HttpRequest) -> bool:
+    """Whether it asks for MQTT over WebSocket; WebSocket checks the rest."""
+    asked = (request.get("upgrade") or "").lower()
+    return request.path == PATH and request.method == "GET" and "websocket" in asked

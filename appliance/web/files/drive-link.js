@@ -1,0 +1,140 @@
+// The connection that drives. Nothing is queued and nothing is sent again: what has not gone out is
+// given up, and the connection ends with each release.
+
+const PERIOD = 50 // ms; the appliance carries a stream of 10 Hz or more
+const PAGE_PATIENCE = 300 // ms without a word of the page: its thread hangs
+const UNANSWERED = 4 // commands on their way; more wait for no one
+const GOODBYE = 1000 // ms for the acknowledgement of the stop message
+
+export class Drive {
+  constructor(open) {
+    this.open = open
+    this.route = null
+    this.client = null
+    this.timer = null
+    this.state = 'idle'
+    this.reason = ''
+    this.sent = this.refused = 0
+  }
+
+  stop() {
+    this.leave()
+  }
+
+  /** Connect for a route, so that the first command need not wait for the login. */
+  prepare(route) {
+    if (this.client !== null && this.route?.mqtt === route.mqtt) return
+    this.leave()
+    this.route = route
+    this.connect()
+  }
+
+  connect() {
+    this.state = 'connecting'
+    const client = this.open({ reconnectPeriod: 0, keepalive: 2 })
+    this.client = client
+    this.unanswered = 0
+    client.on('connect', () => {
+      if (client === this.client) this.state = 'ready'
+    })
+    client.on('error', (error) => {
+      if (client === this.client) this.reason = String(error.message)
+    })
+    client.on('close', () => {
+      if (client !== this.client) return
+      this.halt()
+      this.client = null
+      this.state = 'lost'
+    })
+  }
+
+  go(linear, angular) {
+    this.wanted = [linear, angular]
+    this.heard = Date.now()
+    if (this.client === null && this.route !== null && this.timer === null) this.connect()
+    if (this.timer !== null) return
+    this.reason = ''
+    this.timer = setInterval(() => this.command(), PERIOD)
+    this.command()
+  }
+
+  command() {
+    if (Date.now() - this.heard > PAGE_PATIENCE) {
+      this.release()
+      this.reason = 'The page did not answer; stopped.'
+      return
+    }
+    if (!this.client?.connected || this.unanswered >= UNANSWERED) return
+    this.state = 'driving'
+    this.publish(...this.wanted)
+  }
+
+  publish(linear, angular) {
+    const twist = { linear: { x: linear, y: 0, z: 0 }, angular: { x: 0, y: 0, z: angular } }
+    const command = this.route.isStamped ? { header: { stamp: 'now' }, twist } : twist
+    const client = this.client
+    this.unanswered += 1
+    this.sent += 1
+    client.publish(
+      this.route.mqtt,
+      JSON.stringify(command),
+      { qos: 1, properties: { contentType: 'application/json' } },
+      (error, packet) => {
+        if (client === this.client) this.unanswered -= 1
+        // The first two commands of a stream are refused as possibly old; then that is over.
+        if (!error && this.timer !== null) this.reason = ''
+        const code = packet?.reasonCode ?? error?.code ?? 0
+        if (error && code >= 0x80) {
+          this.refused += 1
+          const words = packet?.properties?.reasonString
+          if (words) this.reason = words
+          else if (code === 0x87) {
+            this.reason = 'Not authorized: another client commands, or no access rule lets this user '
+              + `write ${this.route?.mqtt}.`
+          } else this.reason = error.message
+        }
+      },
+    )
+  }
+
+  halt() {
+    clearInterval(this.timer)
+    this.timer = null
+  }
+
+  /** Zero, then DISCONNECT: the appliance stops the robot for either of them. */
+  release() {
+    if (this.timer === null) return
+    this.halt()
+    const client = this.client
+    if (client?.connected) {
+      this.publish(0, 0)
+      this.goodbye(client)
+    } else {
+      client?.end(true)
+    }
+    this.client = null
+    this.connect()
+  }
+
+  goodbye(client) {
+    const late = setTimeout(() => client.end(true), GOODBYE)
+    client.end(false, {}, () => clearTimeout(late))
+  }
+
+  leave() {
+    if (this.timer !== null && this.client?.connected) this.publish(0, 0)
+    this.halt()
+    const client = this.client
+    this.client = null
+    this.route = null
+    this.state = 'idle'
+    if (client?.connected) this.goodbye(client)
+    else client?.end(true)
+  }
+
+  told() {
+    const { state, reason, sent, refused } = this
+    return { state, reason, sent, refused }
+  }
+}

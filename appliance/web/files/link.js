@@ -1,0 +1,137 @@
+// The page's side of the worker: what it has told, as signals that the parts of the page follow.
+
+import { batch, signal } from './vendor/signals-core.mjs'
+
+const FRAME = 100 // ms between two questions; the values change twice a second
+
+export const session = signal({ name: 'out', reason: '' })
+export const user = signal('')
+export const rows = new Map() // topic → signal of its row
+export const names = signal([]) // all topics, sorted
+export const untold = signal(0)
+export const robots = signal(new Map()) // robot → {routes, skipped}
+export const inspected = signal(null)
+export const drive = signal(null)
+export const isPaused = signal(false)
+
+let worker = null
+let number = 0
+const waiting = new Map()
+
+export function ask(call, values) {
+  if (worker === null) start()
+  number += 1
+  const asked = new Promise((resolve, reject) => waiting.set(number, { resolve, reject }))
+  worker.postMessage({ number, call, values })
+  return asked
+}
+
+/** Tell without an answer that anybody waits for. */
+export function tell(call, values) {
+  ask(call, values).catch(() => {})
+}
+
+function start() {
+  worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' })
+  worker.onmessage = ({ data }) => {
+    const found = waiting.get(data.number)
+    waiting.delete(data.number)
+    if (data.error === undefined) found?.resolve(data.answer)
+    else found?.reject(new Error(data.error))
+  }
+  worker.onerror = () => {
+    session.value = { name: 'failed', reason: 'The connection’s program could not be loaded.' }
+  }
+  requestAnimationFrame(frame)
+}
+
+let asked = 0
+
+/** One question at a time, and none while the page is hidden: the browser draws no frames then. */
+async function frame(now) {
+  if (now - asked < FRAME) {
+    requestAnimationFrame(frame)
+    return
+  }
+  asked = now
+  try {
+    take(await ask('frame'))
+  } finally {
+    requestAnimationFrame(frame)
+  }
+}
+
+function take(told) {
+  batch(() => {
+    const old = session.peek()
+    if (old.name !== told.state.name || old.reason !== told.state.reason) session.value = told.state
+    drive.value = told.drive
+    if (told.about) {
+      const found = new Map(robots.peek())
+      for (const [name, value] of told.about) {
+        const [robot, what] = name.split(' ')
+        if (Array.isArray(value) || what !== 'routes') {
+          found.set(robot, { ...found.get(robot), [what]: value })
+        }
+      }
+      robots.value = found
+    }
+    if (told.state.name === 'out' || told.state.name === 'refused') forget()
+    if (untold.peek() !== told.untold) untold.value = told.untold
+    if (!isPaused.peek()) takeRows(told.rows)
+    else held.push(...told.rows.slice(0, 1000))
+    if (held.length > 5000) held.splice(0, held.length - 5000)
+    if (told.focus) {
+      inspected.peek()?.bitmap?.close()
+      inspected.value = told.focus
+    }
+  })
+}
+
+const held = [] // rows that came while the page was paused
+
+export function pause(paused) {
+  isPaused.value = paused
+  tell('pause', { paused })
+  if (!paused) batch(() => takeRows(held.splice(0)))
+}
+
+function takeRows(told) {
+  let isMore = false
+  for (const [topic, text, size, rate, at, retain] of told) {
+    const row = { text, size, rate, at, retain }
+    const known = rows.get(topic)
+    if (known) known.value = row
+    else {
+      rows.set(topic, signal(row))
+      isMore = true
+    }
+  }
+  if (isMore) names.value = [...rows.keys()].sort()
+}
+
+function forget() {
+  if (rows.size) {
+    rows.clear()
+    names.value = []
+  }
+  if (robots.peek().size) robots.value = new Map()
+  inspected.value = null
+}
+
+export function focus(topic) {
+  inspected.value = null
+  tell('focus', { topic })
+}
+
+export function signIn(name, password) {
+  const url = `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/mqtt`
+  user.value = name
+  session.value = { name: 'connecting', reason: '' }
+  return ask('signIn', { url, user: name, password })
+}
+
+export function signOut() {
+  user.value = ''
+  tell('signOut')
+}

@@ -1,0 +1,206 @@
+// The connections, away from the page: it keeps the newest of each topic, and hands the page what
+// has changed when the page asks, once a frame. The password is in this memory only.
+
+import mqtt from './vendor/mqtt.esm.js'
+import { Drive } from './drive-link.js'
+import { Focus } from './focus.js'
+import { cut, preview } from './formats.js'
+
+const TOPICS = 20000 // that are kept; of more the number is told
+const KEPT = 32 * 1024 * 1024 // bytes of payloads that are kept whole
+const SURVEY_PACKET = 32 * 1024
+const FOCUS_PACKET = 12 * 1024 * 1024
+const CHANGES = 500 // topics in one answer to the page
+const MAX_RATE = '2' // messages a second of each topic in the survey
+
+let login = null
+let survey = null
+let focus = null
+let drive = null
+let state = { name: 'out', reason: '' }
+let topics = new Map()
+let changed = new Set()
+let kept = 0
+let untold = 0
+let about = new Map() // what the appliance says about itself
+
+function options(more, packet) {
+  return {
+    protocolVersion: 5,
+    clientId: `console-${crypto.getRandomValues(new Uint32Array(2)).join('-')}`,
+    username: login.user,
+    password: login.password,
+    clean: true,
+    keepalive: 15,
+    connectTimeout: 10000,
+    reconnectPeriod: 1000,
+    resubscribe: false,
+    queueQoSZero: false,
+    timerVariant: 'native',
+    properties: { maximumPacketSize: packet, sessionExpiryInterval: 0 },
+    ...more,
+  }
+}
+
+export function open(more, packet) {
+  return mqtt.connect(login.url, options(more, packet))
+}
+
+function subscribe(client, filters, rate) {
+  const properties = rate ? { userProperties: { 'max-rate': rate } } : {}
+  return new Promise((resolve) => {
+    client.subscribe(filters, { qos: 0, properties }, (error, granted, packet) => {
+      resolve(packet?.granted ?? (error ? [0x80] : []))
+    })
+  })
+}
+
+function signIn({ url, user, password }) {
+  signOut()
+  login = { url, user, password }
+  state = { name: 'connecting', reason: '' }
+  const client = open({}, SURVEY_PACKET)
+  survey = client
+  client.on('connect', async () => {
+    if (client !== survey) return
+    state = { name: 'in', reason: '' }
+    const granted = await subscribe(client, ['#', '$SYS/#'], MAX_RATE)
+    if (client === survey && granted[0] >= 0x80) state.reason = 'This user may read no topic.'
+    focus ??= new Focus(() => open({}, FOCUS_PACKET), takeAbout)
+    drive ??= new Drive((more) => open(more, SURVEY_PACKET))
+  })
+  client.on('message', take)
+  client.on('error', (error) => {
+    if (client !== survey) return
+    const code = error.code
+    const isRefused = typeof code === 'number' && code > 0
+    if (isRefused && state.name !== 'in') {
+      const bad = code === 0x86 || code === 0x87 || code === 4 || code === 5
+      end({ name: 'refused', reason: bad ? 'User name or password is wrong.' : String(error.message) })
+    } else if (state.name === 'connecting') {
+      state.reason = String(error.message)
+    }
+  })
+  client.on('close', () => {
+    if (client !== survey) return
+    if (state.name === 'in') state = { name: 'lost', reason: 'The connection is lost; trying again.' }
+    else if (state.name === 'connecting') end({ name: 'failed', reason: 'No connection.' })
+  })
+}
+
+function end(reason) {
+  signOut()
+  state = reason
+}
+
+function signOut() {
+  for (const each of [focus, drive]) each?.stop()
+  survey?.end(true)
+  survey = focus = drive = login = null
+  topics = new Map()
+  changed = new Set()
+  about = new Map()
+  kept = untold = 0
+  state = { name: 'out', reason: '' }
+}
+
+function take(topic, buffer, packet) {
+  let entry = topics.get(topic)
+  if (entry === undefined) {
+    if (topics.size >= TOPICS) {
+      untold += 1
+      return
+    }
+    entry = { count: 0, before: 0, rate: 0, payload: new Uint8Array(0) }
+    topics.set(topic, entry)
+  }
+  kept -= entry.payload.length
+  const isRoom = kept + buffer.length <= KEPT
+  // A copy: the buffer is a view of all that has come with it.
+  entry.payload = Uint8Array.from(isRoom ? buffer : buffer.subarray(0, 256))
+  entry.size = buffer.length
+  kept += entry.payload.length
+  entry.properties = packet.properties ?? {}
+  entry.retain = packet.retain
+  entry.qos = packet.qos
+  entry.at = Date.now()
+  entry.count += 1
+  changed.add(topic)
+}
+
+function takeAbout(topic, buffer) {
+  try {
+    if (buffer.length > 4 * 1024 * 1024) return
+    const what = topic.slice(topic.indexOf('/_appliance/') + 12)
+    if (what !== 'routes' && what !== 'skipped' && what !== 'state') return
+    const text = new TextDecoder().decode(buffer)
+    const value = what === 'state' ? text : JSON.parse(text)
+    about.set(`${topic.slice(0, topic.indexOf('/'))} ${what}`, value)
+  } catch {
+    // Not ours then: what the appliance publishes is JSON.
+  }
+}
+
+/** Rates once a second; a topic whose rate has changed is told again. */
+setInterval(() => {
+  for (const [topic, entry] of topics) {
+    if (entry.count < 2) {
+      entry.before = entry.count
+      continue // what comes once has no rate
+    }
+    const now = entry.count - entry.before
+    entry.before = entry.count
+    if (now === 0 && entry.rate === 0) continue
+    const rate = now === 0 && entry.rate < 0.05 ? 0 : 0.7 * entry.rate + 0.3 * now
+    if (rate.toFixed(1) !== entry.rate.toFixed(1)) changed.add(topic)
+    entry.rate = rate
+  }
+}, 1000)
+
+async function frame() {
+  const rows = []
+  for (const topic of changed) {
+    if (rows.length >= CHANGES) break
+    changed.delete(topic)
+    const { payload, properties, size, rate, at, retain } = topics.get(topic)
+    rows.push([topic, cut(preview(payload, properties), 200), size, rate, at, retain])
+  }
+  const told = { state, rows, total: topics.size, untold }
+  if (about.size) {
+    told.about = [...about]
+    about.clear()
+  }
+  told.focus = (await focus?.told()) ?? null
+  told.drive = drive?.told() ?? null
+  return told
+}
+
+const calls = {
+  signIn,
+  signOut,
+  frame,
+  focus: ({ topic }) => {
+    const known = topics.get(topic)
+    focus?.look(topic, known && known.payload.length === known.size ? known : null)
+  },
+  plot: ({ path }) => focus?.plot(path),
+  show: ({ index }) => focus?.show(index),
+  pause: ({ paused }) => focus?.pause(paused),
+  export: () => focus?.export(),
+  ready: ({ route }) => drive?.prepare(route),
+  go: ({ linear, angular }) => drive?.go(linear, angular),
+  stop: () => drive?.release(),
+  leave: () => drive?.leave(),
+}
+
+self.onmessage = async ({ data: { number, call, values } }) => {
+  let answer = null
+  try {
+    answer = await calls[call](values ?? {})
+  } catch (error) {
+    self.postMessage({ number, error: String(error?.message ?? error) })
+    return
+  }
+  const pictures = answer?.focus?.bitmap ? [answer.focus.bitmap] : []
+  self.postMessage({ number, answer: answer ?? null }, pictures)
+}

@@ -1,0 +1,416 @@
+"""The console in a real Chromium, against an appliance with the demo robot on the ROS bus."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from appliance_process import ROBOT, ApplianceProcess
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from interop.paho_peer import V5, Peer
+from npm_packages import DIRECTORY, install
+from ros_domain import DOMAIN
+from waiting import PATIENCE, eventually
+
+pytest.importorskip("rclpy")
+sync_api = pytest.importorskip("playwright.sync_api")
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+
+ACL = """\
+user alice
+topic readwrite {robot}/#
+topic read $SYS/#
+
+user viewer
+topic read {robot}/#
+"""
+PASSWORD = "only-to-look-at-1"
+
+BRIDGE = {
+    "discovery": "localhost",
+    "topics": [
+        {"ros": "/odom", "to": "mqtt", "rate": 10},
+        {
+            "ros": "/cmd_vel",
+            "to": "ros",
+            "type": "geometry_msgs/msg/Twist",
+            "exclusive": True,
+            "on_silence": {"after": "500 ms", "publish": {}},
+            "clamp": {"linear.x": [-0.25, 0.5], "angular.z": [-1, 1]},
+        },
+        {"ros": "/other/cmd_vel", "to": "ros", "type": "geometry_msgs/msg/TwistStamped"},
+    ],
+}
+PHONE = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
+DESKTOP = {"viewport": {"width": 1280, "height": 800}}
+#: Where pictures of the pages go, when somebody wants to look at them.
+PICTURES = os.environ.get("CONSOLE_PICTURES")
+SPEED = 0.1  # m/s; above it the robot drives, by the console's 50 % of the clamp
+
+
+class Odometry:
+    """What the robot does, as a client of MQTT is told."""
+
+    def __init__(self, appliance: ApplianceProcess) -> None:
+        self.peer = Peer(appliance, V5)
+        self.speed = 0.0
+        self.x = 0.0
+        self.count = 0
+        self.peer.client.on_message = self._receive
+
+    def _receive(self, client: Any, data: Any, message: Any) -> None:
+        odometry = json.loads(message.payload)
+        self.speed = odometry["twist"]["twist"]["linear"]["x"]
+        self.x = odometry["pose"]["pose"]["position"]["x"]
+        self.count += 1
+
+    def stands(self) -> None:
+        """Return when a message that is new says so."""
+        before = self.count
+        eventually(lambda: self.count > before + 1 and self.speed == 0, "the robot stands")
+
+
+@pytest.fixture(scope="module")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
+    bind = "127.0.0.1:0"
+    web = {"bind": bind, "protocol": "web"}
+    listeners = [{"bind": bind, "tls": True}, {"bind": bind}, {**web, "tls": True}, web]
+    process = ApplianceProcess(
+        tmp_path_factory.mktemp("console"),
+        users={"viewer": PASSWORD},
+        acl=ACL,
+        broker={"listeners": listeners},
+        bridge=BRIDGE,
+    )
+    bus = {"ROS_DOMAIN_ID": DOMAIN, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    process.environment = bus
+    process.start()
+    robot = subprocess.Popen(
+        [sys.executable, "-m", "appliance.cli.demo_robot"], env={**os.environ, **bus}
+    )
+    yield process
+    robot.terminate()
+    robot.wait(PATIENCE)
+    process.stop()
+
+
+@pytest.fixture(scope="module")
+def odometry(appliance: ApplianceProcess) -> Iterator[Odometry]:
+    odometry = Odometry(appliance)
+    with odometry.peer as peer:
+        peer.subscribe(f"{ROBOT}/odom")
+        eventually(lambda: odometry.count > 0, "the robot's odometry")
+        yield odometry
+
+
+@pytest.fixture(scope="module")
+def origin(appliance: ApplianceProcess) -> str:
+    lines = appliance.wait_for_log(r"listening for the web on \S+:(\d+)$", 2)
+    return f"https://localhost:{lines[0].rpartition(':')[2]}"
+
+
+@pytest.fixture(scope="module")
+def browser(appliance: ApplianceProcess) -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium: apt-get install chromium")
+    certificate = (appliance.directory / "certs/server.crt").read_bytes()
+    key = x509.load_pem_x509_certificate(certificate).public_key()
+    digest = hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo))
+    trusted = base64.b64encode(digest.digest()).decode()
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM,
+            timeout=PATIENCE * 1000,
+            args=[
+                "--no-sandbox",
+                "--disable-gpu",
+                "--disable-dev-shm-usage",
+                f"--ignore-certificate-errors-spki-list={trusted}",
+            ],
+        )
+        yield browser
+        browser.close()
+
+
+class Visit:
+    """A browser's window at the console, and all that went wrong in it."""
+
+    def __init__(self, browser: Any, origin: str, passwords: dict[str, str], options: Any) -> None:
+        self._context = browser.new_context(**options)
+        self._context.set_default_timeout(PATIENCE * 1000)
+        self._passwords = passwords
+        self.page = self._context.new_page()
+        self.wrong: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("requestfailed", lambda request: self.wrong.append(f"failed: {request.url}"))
+        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
+        self.page.on("dialog", lambda dialog: (self.wrong.append(dialog.message), dialog.dismiss()))
+        self.page.on("console", self._said)
+        self.page.goto(origin)
+
+    def _said(self, message: Any) -> None:
+        if message.type == "error":
+            self.wrong.append(message.text)
+
+    def sign_in(self, user: str = "alice", page: str = "") -> Any:
+        self.page.fill("input[name=user]", user)
+        self.page.fill("input[name=password]", self._passwords[user])
+        self.page.click("form button")
+        self.page.wait_for_selector("nav")
+        if page:
+            self.page.click(f"nav a:has-text('{page}')")
+        return self.page
+
+    def look(self, name: str) -> None:
+        """Have axe look at the page, and keep a picture where that is wanted."""
+        if PICTURES:
+            self.page.screenshot(path=f"{PICTURES}/{name}.png", full_page=True)
+        axe = (DIRECTORY / "node_modules/axe-core/axe.min.js").read_text()
+        self.page.evaluate(axe)
+        found = self.page.evaluate(
+            "axe.run({runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']})"
+        )
+        told = [
+            (each["id"], [node["html"] for node in each["nodes"]]) for each in found["violations"]
+        ]
+        assert told == [], name
+
+    def close(self) -> None:
+        self._context.close()
+
+
+@pytest.fixture
+def visit(browser: Any, origin: str, appliance: ApplianceProcess) -> Iterator[Callable[..., Visit]]:
+    install()
+    visits: list[Visit] = []
+
+    def begin(**options: Any) -> Visit:
+        visits.append(Visit(browser, origin, appliance.passwords, options))
+        return visits[-1]
+
+    yield begin
+    for each in visits:
+        each.close()
+    assert [wrong for each in visits for wrong in each.wrong] == []
+
+
+def wait_for_change(page: Any, place: str) -> None:
+    """Return when there is another text at a place of the page."""
+    first = page.inner_text(place)
+    eventually(lambda: page.inner_text(place) != first, "another value")
+
+
+def hold(page: Any, *, x: float = 0.5, y: float = 0.02) -> None:
+    """Press the field, at a part of its width and height."""
+    page.wait_for_selector(".pad[aria-disabled=false]")
+    page.wait_for_selector("dd:text-is('ready')")
+    box = page.locator(".pad").bounding_box()
+    page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+    page.mouse.down()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_sign_in_and_look(visit: Callable[..., Visit], odometry: Odometry, scheme: str) -> None:
+    """Journeys 1 and 11: what is loaded is small and ours, and the odometry is there."""
+    for kind, options in (("phone", PHONE), ("desktop", DESKTOP)):
+        visited = visit(color_scheme=scheme, **options)
+        page = visited.page
+        page.wait_for_selector(".fingerprint")
+        assert len(visited.requests) <= 12, visited.requests
+        visited.look(f"{kind}-{scheme}-1-sign-in")
+        visited.sign_in()
+        page.wait_for_selector(f"td >> text='{ROBOT}/odom'")
+        visited.look(f"{kind}-{scheme}-2-overview")
+        page.click("nav a:has-text('Topics')")
+        wait_for_change(page, f"a[href$='{ROBOT}%2Fodom'] .value")
+        visited.look(f"{kind}-{scheme}-3-topics")
+        page.click("nav a:has-text('Drive')")
+        page.wait_for_selector("dd:text-is('ready')")
+        visited.look(f"{kind}-{scheme}-4-drive")
+        assert {re.match(r"\w+://[^/]*", url)[0] for url in visited.requests} <= {  # type: ignore[index]
+            page.evaluate("location.origin"),
+            page.evaluate("location.origin.replace('https', 'wss')"),
+            "blob:",
+        }
+        visited.close()
+
+
+def test_a_wrong_password(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
+    page = visit(**PHONE).page
+    page.fill("input[name=user]", "alice")
+    page.fill("input[name=password]", "wrong")
+    page.click("form button")
+    page.wait_for_selector("text=User name or password is wrong.")
+    assert page.input_value("input[name=password]") == ""
+
+
+def test_a_phone_drives(visit: Callable[..., Visit], odometry: Odometry) -> None:
+    """Journey 2: it drives while the field is held, no faster than the clamp, and then stops."""
+    visited = visit(**PHONE)
+    page = visited.sign_in(page="Drive")
+    hold(page)
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    assert odometry.speed <= 0.25 + 1e-6  # half of the clamp
+    page.wait_for_selector(".notice.bad", state="detached")  # the first two may have been old
+    page.mouse.up()
+    odometry.stands()
+    hold(page, y=0.98)
+    eventually(lambda: odometry.speed < -SPEED, "it drives back")
+    second = visit(**PHONE)
+    other = second.sign_in(page="Drive")
+    hold(other)
+    other.wait_for_selector(".notice.bad")
+    assert "alice') commands /cmd_vel" in other.inner_text(".notice.bad")
+    # axe holds its page up, on a slow computer for longer than a driver may be silent, and then the
+    # second one may drive: the first page is looked at when the second has let go.
+    second.look("phone-6-not-driving")
+    other.mouse.up()
+    eventually(lambda: odometry.speed < -SPEED, "the first one still drives back")
+    visited.look("phone-5-driving")
+    eventually(lambda: odometry.speed < -SPEED, "and drives on behind axe")
+    page.evaluate("window.dispatchEvent(new Event('blur'))")
+    odometry.stands()
+    assert page.inner_text(".hint") == "Hold to drive"
+
+
+def test_keys_drive_while_they_are_held(visit: Callable[..., Visit], odometry: Odometry) -> None:
+    page = visit(**DESKTOP).sign_in(page="Drive")
+    page.wait_for_selector("dd:text-is('ready')")
+    page.focus(".pad")
+    page.keyboard.down("ArrowUp")
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    page.keyboard.up("ArrowUp")
+    odometry.stands()
+    page.wait_for_selector("dd:text-is('ready')")
+    page.keyboard.down("KeyW")
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    page.evaluate("location.hash = '#/overview'")
+    odometry.stands()
+
+
+def test_a_browser_that_hangs(
+    visit: Callable[..., Visit], browser: Any, odometry: Odometry, appliance: ApplianceProcess
+) -> None:
+    """Journey 2: whatever happens to the browser, silence stops the robot."""
+    page = visit(**PHONE).sign_in(page="Drive")
+    hold(page)
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    processes = [
+        each
+        for each in psutil.Process().children(recursive=True)
+        if each.name().startswith("chrom")
+    ]
+    assert processes
+    for process in processes:
+        process.send_signal(signal.SIGSTOP)
+    try:
+        odometry.stands()
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGCONT)
+    page.mouse.up()
+    odometry.stands()
+
+
+def test_a_route_that_would_not_stop(visit: Callable[..., Visit], odometry: Odometry) -> None:
+    """No driving without `on_silence`; the page says why."""
+    page = visit(**PHONE).sign_in(page="Drive")
+    page.select_option("select", f"{ROBOT}/other/cmd_vel")
+    page.wait_for_selector(".pad[aria-disabled=true]")
+    assert "on_silence" in page.inner_text(".notice.bad")
+
+
+def test_a_viewer_does_not_drive(visit: Callable[..., Visit], odometry: Odometry) -> None:
+    """What the access rules refuse is refused by the broker, and the page says so."""
+    page = visit(**PHONE).sign_in("viewer", "Drive")
+    hold(page)
+    page.wait_for_selector(".notice.bad >> text=/not/i")
+    page.mouse.up()
+    odometry.stands()
+
+
+def test_inspect(
+    visit: Callable[..., Visit], odometry: Odometry, appliance: ApplianceProcess, tmp_path: Path
+) -> None:
+    """Journey 4: properties, difference, plot, history and export."""
+    visited = visit(**DESKTOP)
+    page = visited.sign_in(page="Topics")
+    topic = f"{ROBOT}/test/value"
+    table = {"ContentType": "application/json", "UserProperty": ("ros-type", "a/b")}
+    with Peer(appliance, V5) as peer:
+        peer.publish(topic, '{"big": 9007199254740993, "n": 1}', retain=True, **table)
+        page.click(f"a[href$='{topic.replace('/', '%2F')}']")
+        page.wait_for_selector(".leaves bdi:text-is('9007199254740993')")
+        assert "a/b" in page.inner_text(".properties")
+        page.click("[aria-label='Plot n']")
+        for number in range(2, 6):
+            peer.publish(topic, json.dumps({"big": 9007199254740993, "n": number}), **table)
+            page.wait_for_selector(f"tr.changed bdi:text-is('{number}')")
+            assert page.inner_text("tr.changed td:nth-child(3)") == str(number - 1)
+        page.wait_for_selector("figcaption:has-text('n: 5 (5 points)')")
+        page.wait_for_selector(".plot canvas")
+        page.click("summary")
+        page.click(".inspector li:last-child button")
+        page.wait_for_selector(".leaves bdi:text-is('1')")
+        visited.look("desktop-7-inspector")
+        with page.expect_download() as download:
+            page.click("text=/^Export/")
+    path = tmp_path / "history.jsonl"
+    download.value.save_as(path)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [json.loads(line["payload"])["n"] for line in lines] == [1, 2, 3, 4, 5]
+    assert lines[0]["topic"] == topic and ["ros-type", "a/b"] in lines[0]["properties"]
+
+
+HOSTILE = {
+    "markup": ("text/html", b"<img src=x onerror=alert(1)><script>alert(2)</script>"),
+    "<img src=x onerror=alert(3)>": ("text/plain", b"in the name"),
+    "proto": ("application/json", b'{"__proto__": {"hacked": 1}, "constructor": {"a": 1}}'),
+    "vnode": ("application/json", b'{"type": "script", "props": {"children": "alert(4)"}}'),
+    "deep": ("application/json", b"[" * 15000 + b"]" * 15000),
+    "utf-8": ("application/json", b'"\xff\xfe"'),
+    "svg": ("image/svg+xml", b"<svg xmlns='http://www.w3.org/2000/svg' onload='alert(5)'/>"),
+    "jpeg": ("image/jpeg", b"\xff\xd8\xff\x00 no picture"),
+    "cbor": ("application/cbor", bytes([0x81]) * 15000),
+    "x" * 5000: ("text/plain", b"a long name"),
+    "\u202e control": ("text/plain", b"turned round"),
+}
+
+
+def test_hostile_payloads(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
+    """Journey 10: no script runs, nothing is asked for, and the page goes on."""
+    visited = visit(**DESKTOP)
+    page = visited.sign_in(page="Topics")
+    with Peer(appliance, V5) as peer:
+        # Not ours: what the appliance would say about itself, from somebody else.
+        for name, (content_type, payload) in HOSTILE.items():
+            topic = f"{ROBOT}/hostile/{name}"
+            peer.publish(topic, payload, retain=True, ContentType=content_type)
+        peer.publish(f"{ROBOT}/hostile/large", bytes(9 << 20), retain=True)
+        page.fill("input[type=search]", "hostile")
+        page.wait_for_selector(f"text='{len(HOSTILE)} topics'")  # the large one does not come
+        for name in [*HOSTILE, "large"]:
+            topic = f"{ROBOT}/hostile/{name}"
+            page.evaluate("topic => location.hash = '#/topics/' + encodeURIComponent(topic)", topic)
+            page.wait_for_selector(".inspector .properties")
+        assert page.evaluate("({}).hacked === undefined")
+        for name in [*HOSTILE, "large"]:
+            peer.publish(f"{ROBOT}/hostile/{name}", b"", retain=True)
+    assert all("hostile" not in url.partition("#")[0] for url in visited.requests)
+    page.click("nav a:has-text('Overview')")
+    page.wait_for_selector("h1:text-is('Overview')")
