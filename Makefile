@@ -20,7 +20,7 @@ VENV_OPTIONS := --system-site-packages
 TEST_EXTRAS := [test]
 BINARY_EXTRAS := [binary]
 else
-RUN_EXTRAS := [ros]
+RUN_EXTRAS := [ros,camera]
 TEST_EXTRAS := [ros,test]
 BINARY_EXTRAS := [ros,binary]
 endif

@@ -78,10 +78,11 @@ INLINE = {
     "connection.last_turn": ("broker.client", "ClientHandler", "send_on", "_leave"),
     "connection.login": ("net.connection", "ClientConnection", "_resume_input", "_log_in"),
     "connection.turn": ("net.connection", "ClientConnection", "take_turn", "_run_turns"),
-    "control.command": ("app.main", "App", "_answer_status", ""),
+    "control.command": ("app.management", "ApplianceVerbs", "_status", ""),
     "control.connection": ("ops.control", "Control", "_answer", "_serve"),
     "flush": ("broker.output", "Output", "flush", "broker/broker.py:flush"),
     "flush.wait": ("broker.output", "Output", "wait", "_hold_back"),
+    "http.respond": ("net.http", "HttpLayer", "_answer_counted", "_respond"),
     "listener.admit": ("net.listeners", "Listeners", "admit", "_accept"),
     "listener.open": ("net.listeners", "_ListeningSocket", "open", "_open_sockets"),
     "session.replay": ("broker.retained", "RetainedMessages", "find_in_steps", "_find_retained"),
@@ -232,7 +233,7 @@ class Saboteur:
         monkeypatch.setattr(entries.PeriodicCallback, "__init__", repeated)
         monkeypatch.setattr(entries._ContainedProxy, "__init__", shielded)
         monkeypatch.setattr(Faults, "run", ran)
-        names = ("net.connection", "net.tls", "net.websocket")
+        names = ("net.connection", "net.http", "net.tls", "net.websocket")
         for name in (*names, "upstream.transport", "upstream.websocket_client"):
             module = importlib.import_module(f"appliance.{name}")
             for kind in vars(module).values():

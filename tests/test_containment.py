@@ -20,7 +20,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 import uvloop
@@ -53,6 +53,7 @@ from appliance.mqtt.packets import (
 from appliance.mqtt.reason import ReasonCode
 from appliance.net import connection as wire
 from appliance.net import lingering, listeners, tls
+from appliance.net.http import HttpResponse
 from appliance.ops.control import ControlError, ask
 from appliance.ops.crash import CrashReports
 from appliance.ops.sd_notify import Notifier
@@ -62,6 +63,7 @@ from appliance.ros.calls.routes import CallRoutes, ParameterSettings, ServiceSet
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules, OnSilence
 from appliance.store import committer, sqlite
+from appliance.web.site import WebSite
 
 #: Attempts to pass an entry within PATIENCE: a fault may hit the client that tries.
 ATTEMPTS = 3
@@ -163,6 +165,22 @@ class Subscriber(Actor):
         await asyncio.sleep(0.1)
 
 
+class Rated(Actor):
+    """A subscription with a rate: the last message comes, when it is its turn."""
+
+    async def begin(self, peer: Peer) -> None:
+        rate = {Property.USER_PROPERTY: [("max-rate", "50")]}
+        await peer.send(Subscribe(1, [Subscription(f"load/{self.name}/+")], rate))
+        await self.wait_for(peer, Suback)
+
+    async def step(self, peer: Peer) -> None:
+        for payload in (b"first", b"replaced", b"%d" % self.done):
+            await peer.send(Publish(f"load/{self.name}/{self.done % 3}", payload))
+        while (await self.wait_for(peer, Publish)).payload != b"%d" % self.done:
+            pass
+        await asyncio.sleep(0.01)
+
+
 class Willing(Actor):
     """A client whose connection is cut, and its will."""
 
@@ -218,6 +236,21 @@ class Keeper(Actor):
         await asyncio.sleep(0.3)
 
 
+class Manager(Actor):
+    """It asks who is connected, and is answered."""
+
+    async def begin(self, peer: Peer) -> None:
+        replies = f"$CONTROL/appliance/v1/clients/_reply/{self.name}/#"
+        await peer.send(Subscribe(1, [Subscription(replies)]))
+        await self.wait_for(peer, Suback)
+
+    async def step(self, peer: Peer) -> None:
+        call = f"$CONTROL/appliance/v1/clients/_call/{self.done}"
+        await peer.send(Publish(call, b'{"limit": 5}'))
+        assert (await self.wait_for(peer, Publish)).topic.endswith(f"/{self.done}")
+        await asyncio.sleep(0.05)
+
+
 class Site:
     """The appliance, its clients, and a bus of which the test has the other nodes in hand."""
 
@@ -235,7 +268,9 @@ class Site:
         loop = asyncio.get_running_loop()
         file = self.directory / "appliance.yaml"
         file.write_text(yaml.safe_dump(SETTINGS))
-        (self.directory / "acl.conf").write_text("topic #\ntopic read $SYS/#\n")
+        (self.directory / "acl.conf").write_text(
+            "topic #\ntopic read $SYS/#\ntopic readwrite $CONTROL/#\n"
+        )
         (self.directory / "users.passwd").touch(0o600)
         settings = config.load(file)
         crashes = CrashReports(self.directory / "crashes", settings)
@@ -265,12 +300,14 @@ class Site:
             (Large, 1, "tls"),
             (Large, 1, "websocket"),
             (Subscriber, 2, "plain"),
+            (Rated, 1, "plain"),
             (Willing, 1, "plain"),
             (Willing, 1, "tls"),
             (Silent, 8, "plain"),
             (Silent, 2, "tls"),
             (Sys, 1, "plain"),
             (Keeper, 2, "plain"),
+            (Manager, 1, "plain"),
         ]
         for kind, count, how in kinds:
             for number in range(count):
@@ -323,7 +360,7 @@ class Site:
         return peer
 
     async def dial(self, kind: str = "plain", receive_buffer: int = 0) -> Peer:
-        host, port = self.app.addresses[("plain", "tls", "websocket").index(kind)]
+        host, port = self.app.addresses[("plain", "tls", "websocket", "web").index(kind)]
         secure = {"ssl": self.client, "server_hostname": "localhost"} if kind == "tls" else {}
         if receive_buffer:
             sock = socket.socket()
@@ -453,6 +490,7 @@ SETTINGS = {
             {"bind": "127.0.0.1:0"},
             {"bind": "127.0.0.1:0", "tls": True},
             {"bind": "127.0.0.1:0", "protocol": "websocket"},
+            {"bind": "127.0.0.1:0", "protocol": "web"},
         ],
         "tls": {"certificate": "certs/server.crt", "key": "certs/server.key", "ca": "certs/ca.crt"},
         "anonymous": True,
@@ -704,6 +742,39 @@ async def _websocket(site: Site, patch: pytest.MonkeyPatch) -> None:
         site.hands.append(await site.dial("websocket"))
 
 
+@reach("http.made", "http.chunk", "http.respond", "http.eof", "http.lost")
+async def _browses(site: Site, patch: pytest.MonkeyPatch) -> None:
+    peer = await site.dial("web")
+    site.hands.append(peer)
+    await peer.send(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    if await peer.reader.read(1):
+        peer.writer.close()
+
+
+@reach("http.pause", "http.resume")
+async def _browses_slowly(site: Site, patch: pytest.MonkeyPatch) -> None:
+    peer = await site.dial("web", receive_buffer=4096)
+    site.hands.append(peer)
+    peer.writer.transport.pause_reading()
+    large = HttpResponse(200, bytes(8 << 20))
+    patch.setattr(WebSite, "respond", AsyncMock(return_value=large))
+    faults = site.faults.count
+    await peer.send(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    await until(
+        lambda: site.scheduler.output > 1 << 20 or site.faults.count > faults, "a slow reader"
+    )
+    peer.writer.transport.resume_reading()
+    site.drain(peer)
+
+
+@reach("http.timeout")
+async def _browses_no_more(site: Site, patch: pytest.MonkeyPatch) -> None:
+    with pytest.MonkeyPatch.context() as hurried:
+        hurried.setattr(site.scheduler, "connect_timeout", 0.05)
+        site.hands.append(await site.dial("web"))
+        await asyncio.sleep(0.1)
+
+
 @reach("connection.wait")
 async def _waits(site: Site, patch: pytest.MonkeyPatch) -> None:
     _, protocol = await site.victim()
@@ -854,6 +925,8 @@ async def _busy(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 #: Entries that MQTT load does not pass, and the tests that let them fail.
 ELSEWHERE = {
+    "bridge.announce": "ros/topics/test_commands.py",
+    "bridge.picture": "ros/topics/test_pictures.py",
     "doctor.turn": "ops/test_doctor_links.py",
     **dict.fromkeys(
         (

@@ -42,6 +42,10 @@ NOT_RUN = {
     "make test": "runs all tests, of which this is one",
     ".venv/bin/python -m pytest tests/broker -q -x": "runs tests, which `make test` does as well",
     "make compiled": "compiles for minutes; tests/packaging/test_compiled.py does the same",
+    "curl --cacert ~/appliance/certs/ca.crt https://robot.local:8443/readyz": "needs a listener for"
+    " the web; tests/app/test_web.py asks the same",
+    "appliance clients kick tablet --user alice --host robot.local --ca ca.crt": "needs another"
+    " client; tests/cli/test_clients.py disconnects one",
     "make binary": "builds for minutes; tests/packaging/test_binary.py runs what it builds",
     "make deb": "needs what `make binary` builds; tests/ops/test_install.py makes a package",
     "appliance bench --upstream --messages 1000000": "takes ten minutes; tests/bench has its parts",
@@ -94,7 +98,7 @@ command.GROWTH = tuple(
 
 #: Commands that are for a running appliance, and those that want it stopped; others do not mind.
 NEED_RUNNING = re.compile(
-    r"appliance (status|reload|routes|upstream|doctor|pub|sub|call|goal|param) |mosquitto_"
+    r"appliance (status|reload|routes|clients|upstream|doctor|pub|sub|call|goal|param) |mosquitto_"
 )
 NEED_STOPPED = re.compile(r"appliance (run|store) |make run ")
 #: They run until they are stopped.
@@ -110,7 +114,7 @@ PAGES = pages()
 
 #: A page's bus and its first user.
 BUS = {"docs/ros1.md": "ros1"}
-USER = {"docs/calls.md": "alice"}
+USER = {"docs/calls.md": "alice", "docs/management.md": "alice"}
 #: Pages that command page_robot.py, and what of it has to be on the bus before.
 ROBOT = {"docs/calls.md": {"/reset", "/arm/grip", "/navigate_to_pose", "/controller"}}
 BRIDGE = """\

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 from appliance_process import HOST, ApplianceProcess
 from raw_client import RawClient
-from waiting import PATIENCE
+from waiting import PATIENCE, eventually
 
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
@@ -289,6 +289,27 @@ def test_a_refused_will(robot: ApplianceProcess, client: Open, version: int, nam
         robot.wait_for_log(f"client '{level}-{name}'.*connection lost")
     assert acknowledge(watcher, watcher.drain()) == [(f"r2d2/cmd_vel/{name}", b"gone")]
     robot.wait_for_log(f"client 'odom-{name}'.* may not publish to 'r2d2/odom/{name}'")
+
+
+@both_versions
+@pytest.mark.parametrize("tls", [False], ids=["plain"])
+def test_a_will_on_a_topic_of_the_appliance_itself(
+    robot: ApplianceProcess, client: Open, version: int, name: str
+) -> None:
+    own, allowed = f"r2d2/_appliance/{name}", f"r2d2/cmd_vel/{name}"
+    watcher = watch(client, name, f"r2d2/+/{name}")
+    for number, topic in enumerate((own, allowed)):  # bob may write both by the rules
+        client(f"{number}-{name}", "bob", will=Will(topic, b"gone", 1)).kill()
+        robot.wait_for_log(f"client '{number}-{name}'.*connection lost")
+    came: list[tuple[str, bytes]] = []
+
+    def has_come() -> bool:
+        came.extend(acknowledge(watcher, watcher.drain()))
+        return bool(came)
+
+    eventually(has_come, "the will that is allowed")
+    assert came == [(allowed, b"gone")]
+    robot.wait_for_log(f"client '0-{name}'.* may not publish to '{own}': .* the broker's own")
 
 
 def test_explain_names_the_file_and_the_line(robot: ApplianceProcess) -> None:

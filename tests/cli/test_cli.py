@@ -136,7 +136,7 @@ def test_check_of_what_init_made(output: pytest.CaptureFixture[str]) -> None:
     text = output.readouterr().out
     assert "error" not in text
     assert "users: alice" in text
-    assert "rules: 3" in text
+    assert "rules: 6" in text
 
 
 def test_check_changes_nothing(here: Path) -> None:
@@ -285,7 +285,7 @@ def test_the_first_user_of_a_new_file(here: Path) -> None:
 def test_acl_explain(output: pytest.CaptureFixture[str]) -> None:
     assert run("acl", "explain", "alice", "r2/odom") == 0
     text = output.readouterr().out
-    assert "read       allowed  acl.conf:5: topic read r2/#" in text
+    assert "read       allowed  groups/viewers.conf:3: topic read r2/#" in text
     assert "write      refused" in text
     assert run("acl", "explain", "", "r2/#") == 0
     assert "subscribe  refused" in output.readouterr().out

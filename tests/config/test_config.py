@@ -89,12 +89,13 @@ def test_the_example_routes_of_the_reference_load() -> None:
     routes = bridge.topics
     assert [(route.ros, route.to) for route in routes] == [
         ("/odom", "mqtt"),
+        ("/camera/image_raw", "mqtt"),
         ("/cmd_vel", "ros"),
         (("/camera/**", "!/camera/*/raw"), "mqtt"),
         ("!/secret/**", "mqtt"),
         ("/**", "mqtt"),
     ]
-    assert [route.is_exclusion for route in routes] == [False, False, False, True, False]
+    assert [route.is_exclusion for route in routes] == [False] * 4 + [True, False]
     assert routes[0].mqtt == config.TopicRoute(ros="/a", to="mqtt").mqtt
     assert yaml.safe_load(example)["bridge"]["topics"][0].keys() >= {"ros", "to", "type", "mqtt"}
     for called, model in (
@@ -455,11 +456,12 @@ broker:
     - {bind: ":1", tls: true}
     - {bind: ":2", tls: true, client_certificates: optional, protocol: websocket}
     - {bind: ":3", tls: true, protocol: websocket}
+    - {bind: ":4", tls: true, protocol: web}
 """
     broker = loads(text).broker
     assert (broker.tls.client_certificates, broker.tls.min_version) == ("off", "1.3")
     asked = [broker.client_certificates(listener) for listener in broker.listeners]
-    assert asked == ["off", "optional", "off"]
+    assert asked == ["off", "optional", "off", "off"]
     assert config.loads(yaml.safe_dump(config.describe(loads(text))), HERE).broker == broker
 
 

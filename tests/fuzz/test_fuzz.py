@@ -38,10 +38,13 @@ def test_in_this_process(one_case: Callable[[random.Random], None]) -> None:
 
 @pytest.mark.parametrize("kind", [sessions.Siege, strangers.Strangers])
 def test_sessions(kind: type[sessions.Siege], tmp_path: Path) -> None:
-    siege = kind(tmp_path)
-    try:
-        siege.run(random.Random(0), SECONDS)
-    except Found as found:
-        pytest.fail(f"{found}\n" + "\n\n".join(data.decode() for data in found.data[-5:]))
+    for seconds in (SECONDS, 4 * SECONDS):  # a busy computer makes fewer
+        siege = kind(tmp_path / str(seconds))
+        try:
+            siege.run(random.Random(0), seconds)
+        except Found as found:
+            pytest.fail(f"{found}\n" + "\n\n".join(data.decode() for data in found.data[-5:]))
+        if siege.count > 100:
+            break
     assert siege.count > 100
     assert siege.canary.heard == siege.canary.sent > 100

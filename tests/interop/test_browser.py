@@ -20,9 +20,10 @@ import pytest
 from appliance_process import ACL, ROBOT, ApplianceProcess
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from npm_packages import DIRECTORY
 from paho.mqtt.enums import MQTTProtocolVersion
 from paho_peer import Peer
-from test_mqttjs import DIRECTORY, _installed  # noqa: F401
+from test_mqttjs import _installed  # noqa: F401
 from waiting import PATIENCE, eventually
 from websockets.sync.client import connect
 

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import pytest
 from appliance_process import HOST, ApplianceProcess
+from npm_packages import DIRECTORY, install
 from waiting import PATIENCE
-
-DIRECTORY = Path(__file__).parent / "mqttjs"
-INSTALL_TIMEOUT = 60.0  # seconds
 
 QOS = [0, 1, 2]
 VERSIONS = [4, 5]  # as they stand in CONNECT: 3.1.1 and 5
@@ -22,18 +18,7 @@ VERSIONS = [4, 5]  # as they stand in CONNECT: 3.1.1 and 5
 
 @pytest.fixture(scope="session", autouse=True)
 def _installed() -> None:
-    """MQTT.js as package-lock.json has it, in node_modules; from the registry when it is not."""
-    if shutil.which("node") is None or shutil.which("npm") is None:
-        pytest.skip("there is no node and npm: apt-get install nodejs npm")
-    lock = DIRECTORY / "package-lock.json"
-    installed = DIRECTORY / "node_modules/.package-lock.json"  # npm writes it last
-    if not installed.exists() or installed.stat().st_mtime < lock.stat().st_mtime:
-        subprocess.run(
-            ["npm", "ci", "--silent", "--no-audit", "--no-fund"],
-            cwd=DIRECTORY,
-            check=True,
-            timeout=INSTALL_TIMEOUT,
-        )
+    install()
 
 
 def exchange(

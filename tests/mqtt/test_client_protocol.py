@@ -468,3 +468,44 @@ def test_an_acknowledgement_that_is_wrong(version, wire, code):
 def test_properties_of_an_acknowledgement_are_decoded():
     packet = Pubrec(1, 0x97, {Property.REASON_STRING: "full"})
     assert said(connected(), [packet.encode(5)]) == [packet]
+
+
+BETWEEN = [b"\x40\x03\x00\x01\x10", b"\xd0\x00", b"\x40\x04\x00\x02\x00\x00", b"\x70\x02\x00\x03"]
+RUNS = st.lists(
+    st.lists(st.integers(1, 65535), min_size=1, max_size=20).map(
+        lambda ids: b"".join(b"\x40\x02" + each.to_bytes(2, "big") for each in ids)
+    )
+    | st.sampled_from(BETWEEN),
+    max_size=6,
+).map(b"".join)
+
+
+@given(RUNS, st.binary(max_size=3) | st.just(b"\x40\x02\x00\x00"), st.lists(st.integers(0, 300)))
+def test_pubacks_that_are_taken_at_once_are_the_same(data: bytes, end: bytes, cuts: list[int]):
+    """As those that `receive_data` yields, however the bytes arrive; and so is what follows."""
+
+    def said_by(taking: bool) -> list[object]:
+        client, events = connected(), []
+        try:
+            for start, stop in itertools.pairwise([0, *sorted(cuts), len(data) + len(end)]):
+                part = (data + end)[start:stop]
+                if taking:
+                    packet_ids, part = client.take_pubacks(part)
+                    events += [PacketType.PUBACK << 16 | each for each in packet_ids]
+                events += client.receive_data(part)
+                assert not taking or client.held <= len(data + end)
+        except ProtocolError as error:
+            events.append(error.code)
+        return [*events, client.held, client.take_pubacks(b"\x40\x02\x00\x01"), client.state]
+
+    assert said_by(taking=True) == said_by(taking=False)
+
+
+def test_pubacks_are_taken_only_after_connack():
+    client = started()
+    assert client.take_pubacks(b"\x40\x02\x00\x01") == ((), b"\x40\x02\x00\x01")
+    client = connected()
+    packet_ids, rest = client.take_pubacks(b"\x40\x02\x12\x34\x40\x02\x00\x02\x40\x02\x00")
+    assert (list(packet_ids), rest) == ([0x1234, 2], b"\x40\x02\x00")
+    client.pause()
+    assert client.take_pubacks(b"\x40\x02\x00\x01") == ((), b"\x40\x02\x00\x01")

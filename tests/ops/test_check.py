@@ -324,3 +324,10 @@ def test_what_a_listener_for_websocket_is_for(here: Path) -> None:
     told = [each for each in found(here, listeners=listeners) if "WebSocket" in each.text]
     assert [each.subject for each in told] == ["listener 127.0.0.1:8080"]
     assert "ws://HOST:PORT/mqtt" in told[0].text and "plain MQTT is refused" in told[0].text
+
+
+def test_what_a_listener_for_the_web_is_for(here: Path) -> None:
+    listeners = [{"bind": "127.0.0.1:8080", "protocol": "web"}, {"bind": "127.0.0.1:1883"}]
+    told = [each for each in found(here, listeners=listeners) if "for the web" in each.text]
+    assert [each.subject for each in told] == ["listener 127.0.0.1:8080"]
+    assert "http://HOST:PORT/" in told[0].text

@@ -15,11 +15,11 @@ from appliance.ops import control
 from appliance.ops.control import Control, ControlError, NotRunningError, ask
 
 
-async def answer():
+async def answer(arguments):
     return {"n": 1}
 
 
-async def refuse():
+async def refuse(arguments):
     raise ControlError("the file is wrong")
 
 
@@ -81,7 +81,7 @@ async def test_who_says_nothing_is_not_waited_for_for_ever(path, monkeypatch):
 async def test_who_does_not_read_is_not_waited_for_for_ever(tmp_path, monkeypatch):
     monkeypatch.setattr(control, "REQUEST_TIMEOUT", 0.1)
 
-    async def talk():
+    async def talk(arguments):
         return "x" * 10_000_000
 
     def open_files():

@@ -73,6 +73,22 @@ def test_the_first_user_reads_all_of_the_robot_and_writes_what_is_listed(tmp_pat
         assert not any(acl.decide(nobody, *key).allowed for key in expected)
 
 
+def test_the_groups_that_are_made(tmp_path: Path) -> None:
+    list(initialise(tmp_path, robot="r2", user="alice"))
+    more = "user bob\ninclude groups/drivers.conf\nuser carol\ninclude groups/viewers.conf\n"
+    with (tmp_path / "acl.conf").open("a") as file:
+        file.write(more)
+    acl = Acl.load(tmp_path / "acl.conf", "r2")
+    verbs = "$CONTROL/appliance/v1"
+    for user, may in {"alice": (1, 1, 1, 1), "bob": (0, 1, 1, 1), "carol": (0, 0, 1, 1)}.items():
+        one = Identity(user, "tablet")
+        calls = (f"{verbs}/disconnect/_call", "r2/cmd_vel", f"{verbs}/rights/_call/1")
+        decided = [acl.decide(one, Action.PUBLISH, topic).allowed for topic in calls]
+        decided.append(acl.decide(one, Action.RECEIVE, f"{verbs}/rights/_reply/tablet/1").allowed)
+        assert tuple(map(int, decided)) == may
+        assert not acl.decide(one, Action.RECEIVE, f"{verbs}/rights/_reply/other/1").allowed
+
+
 CALLS = """\
 robot: r2
 bridge:
@@ -89,7 +105,7 @@ bridge:
 def test_the_first_user_may_call_what_is_bridged_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "appliance.yaml").write_text(CALLS)
     list(initialise(tmp_path, user="alice"))
-    lines = (tmp_path / "acl.conf").read_text().splitlines()
+    lines = (tmp_path / "groups/drivers.conf").read_text().splitlines()
     assert [line for line in lines if line.startswith("topic write")] == [
         "topic write {robot}/cmd_vel",
         "topic write {robot}/reset/_call/#",
@@ -133,20 +149,21 @@ def test_the_first_user_may_call_what_is_bridged_and_nothing_else(tmp_path: Path
 def test_parameters_of_ros_1_may_be_at_the_top(tmp_path: Path) -> None:
     (tmp_path / "appliance.yaml").write_text("bridge: {bus: ros1, parameters: [/speed]}")
     list(initialise(tmp_path, user="alice"))
-    lines = (tmp_path / "acl.conf").read_text().splitlines()
+    lines = (tmp_path / "groups/drivers.conf").read_text().splitlines()
     assert "topic write {robot}/_param/speed/set/#" in lines
     assert "topic write {robot}/_param/_set/#" in lines
 
 
 def test_where_nothing_is_called_yet_the_lines_are_shown(tmp_path: Path) -> None:
     list(initialise(tmp_path, robot="r2", user="alice"))
-    text = (tmp_path / "acl.conf").read_text()
+    drivers = tmp_path / "groups/drivers.conf"
+    text = drivers.read_text()
     assert (
         not Acl.load(tmp_path / "acl.conf", "r2")
         .decide(Identity("alice", "tablet"), Action.PUBLISH, "r2/reset/_call")
         .allowed
     )
-    (tmp_path / "acl.conf").write_text(text.replace("\n#topic", "\ntopic"))
+    drivers.write_text(text.replace("\n#topic", "\ntopic"))
     acl = Acl.load(tmp_path / "acl.conf", "r2")
     assert acl.decide(Identity("alice", "tablet"), Action.PUBLISH, "r2/reset/_call").allowed
 
@@ -242,7 +259,7 @@ def test_the_demo_keeps_its_password_in_a_file(tmp_path: Path) -> None:
         ("/cmd_vel", "ros"),
     }
     assert [route.ros for route in settings.bridge.services] == ["/reset"]
-    assert "topic write {robot}/reset/_call/#\n" in (tmp_path / "acl.conf").read_text()
+    assert "topic write {robot}/reset/_call/#\n" in (tmp_path / "groups/drivers.conf").read_text()
 
 
 def test_what_cannot_be(tmp_path: Path) -> None:
