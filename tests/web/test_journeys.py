@@ -31,9 +31,12 @@ sync_api = pytest.importorskip("playwright.sync_api")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 
 ACL = """\
+pattern read $CONTROL/appliance/v1/+/_reply/%c/#
+
 user alice
 topic readwrite {robot}/#
 topic read $SYS/#
+topic write $CONTROL/appliance/v1/+/_call/#
 
 user viewer
 topic read {robot}/#
@@ -59,6 +62,7 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touc
 DESKTOP = {"viewport": {"width": 1280, "height": 800}}
 #: Where pictures of the pages go, when somebody wants to look at them.
 PICTURES = os.environ.get("CONSOLE_PICTURES")
+RIGHTS = json.dumps({"questions": [{"action": "publish", "topic": f"{ROBOT}/cmd_vel"}]})
 SPEED = 0.1  # m/s; above it the robot drives, by the console's 50 % of the clamp
 
 
@@ -414,3 +418,33 @@ def test_hostile_payloads(visit: Callable[..., Visit], appliance: ApplianceProce
     assert all("hostile" not in url.partition("#")[0] for url in visited.requests)
     page.click("nav a:has-text('Overview')")
     page.wait_for_selector("h1:text-is('Overview')")
+
+
+def test_calls_of_the_page_over_a_connection_of_their_own(
+    visit: Callable[..., Visit], appliance: ApplianceProcess
+) -> None:
+    """An answer, an error of the appliance, a call without the right, and one after the end."""
+    page = visit(**DESKTOP).sign_in()
+    link = page.evaluate(
+        "performance.getEntriesByType('resource').map(({ name }) => name)"
+        ".find((name) => name.endsWith('/link.js'))"
+    )
+
+    def call(topic: str, values: str = "{}") -> str:
+        return str(
+            page.evaluate(
+                "([link, topic, values]) => import(link)"
+                ".then(({ request }) => request(topic, values))"
+                ".catch((error) => error.message)",
+                [link, topic, values],
+            )
+        )
+
+    verb = "$CONTROL/appliance/v1/{}/_call"
+    assert '"allowed":true' in call(verb.format("rights"), RIGHTS).replace(" ", "")
+    assert call(verb.format("rights"), '{"question": 1}').startswith("bad_request: ")
+    assert call("elsewhere/_call") == (
+        "This user may not read its answers: pattern read elsewhere/_reply/%c/#"
+    )
+    page.evaluate("link => import(link).then(({ signOut }) => signOut())", link)
+    assert call(verb.format("rights")) == "Nobody is signed in."

@@ -124,6 +124,16 @@ export function focus(topic) {
   tell('focus', { topic })
 }
 
+/** The answer to a call of a service, an action or a verb, as text. Rejects with its error. */
+export function request(topic, payload, timeout) {
+  return ask('request', { topic, payload, timeout })
+}
+
+/** What a verb of the appliance's management answers (docs/management.md). */
+export async function verb(name, values = {}) {
+  return JSON.parse(await request(`$CONTROL/appliance/v1/${name}/_call`, JSON.stringify(values)))
+}
+
 export function signIn(name, password) {
   const url = `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/mqtt`
   user.value = name

@@ -17,6 +17,7 @@ let login = null
 let survey = null
 let focus = null
 let drive = null
+let desk = null // the connection for calls, once somebody calls
 let state = { name: 'out', reason: '' }
 let topics = new Map()
 let changed = new Set()
@@ -95,8 +96,9 @@ function end(reason) {
 
 function signOut() {
   for (const each of [focus, drive]) each?.stop()
+  desk?.stop()
   survey?.end(true)
-  survey = focus = drive = login = null
+  survey = focus = drive = desk = login = null
   topics = new Map()
   changed = new Set()
   about = new Map()
@@ -175,6 +177,14 @@ async function frame() {
   return told
 }
 
+/** The connection for calls, with its module: most visitors never need it. */
+async function calling() {
+  const { Calls } = await import('./calls-link.js')
+  if (login === null) throw new Error('Nobody is signed in.')
+  if (desk === null || desk.isOver) desk = new Calls(open)
+  return desk
+}
+
 const calls = {
   signIn,
   signOut,
@@ -191,6 +201,8 @@ const calls = {
   go: ({ linear, angular }) => drive?.go(linear, angular),
   stop: () => drive?.release(),
   leave: () => drive?.leave(),
+  request: async (values) => (await calling()).request(values),
+  publish: async (values) => (await calling()).publish(values),
 }
 
 self.onmessage = async ({ data: { number, call, values } }) => {
