@@ -56,6 +56,10 @@ SMALL_CHUNK = 2048
 ANSWER_COST = 50
 BODY_PER_COST_UNIT = 16 * 1024
 
+#: Bytes of a body that are handed to the transport at once. The rest waits until they are read: it
+#: is the site's own memory, the same for all who are sent the same.
+BODY_PORTION = 64 * 1024
+
 #: Empty lines that a client may send before a request (RFC 9112, section 2.2), in bytes.
 EMPTY_LINES = 64
 
@@ -163,6 +167,9 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         self._queued = False
         #: The answer that waits for a turn.
         self._response: HttpResponse | None = None
+        #: The body that is being sent, and how many bytes of it the transport has.
+        self._body = b""
+        self._sent = 0
         #: A request is being answered, or its answer is not read yet.
         self._busy = False
         self._writing = True
@@ -388,15 +395,28 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
             headers=[*headers, *caching],
             reason=HTTPStatus(response.status).phrase,
         )
-        parts = [http.send(head)]
-        if self._method != "HEAD":
-            parts.append(http.send(h11.Data(data=response.body)))
-        parts.append(http.send(h11.EndOfMessage()))
         self._limit(self._timeout)
         self._busy = True
         self._pause()
-        self._transport.write(b"".join(part for part in parts if part))
-        if http.our_state is not h11.DONE:
+        self._body = b"" if self._method == "HEAD" else response.body
+        self._sent = 0
+        self._transport.write(http.send(head) + self._next_portion())
+        self._write_on()
+
+    def _next_portion(self) -> bytes:
+        portion = self._body[self._sent : self._sent + BODY_PORTION]
+        self._sent += len(portion)
+        return self._http.send(h11.Data(data=portion))
+
+    def _write_on(self) -> None:
+        """Write more of the body, until the client does not read as fast; go on after its end."""
+        while self._writing and self._sent < len(self._body):
+            self._transport.write(self._next_portion())
+        if self._sent < len(self._body):
+            return
+        self._body, self._sent = b"", 0
+        self._http.send(h11.EndOfMessage())
+        if self._http.our_state is not h11.DONE:
             self._protocol.close()
         elif self._writing:
             self._next()
@@ -480,7 +500,9 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         """It has read most of the answer."""
         self._writing = True
         self._protocol.resume_writing()
-        if self._http.our_state is h11.DONE:
+        if self._http.our_state is h11.SEND_BODY:
+            self._write_on()
+        elif self._http.our_state is h11.DONE:
             self._next()
 
     @contained("http.eof")

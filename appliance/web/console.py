@@ -51,17 +51,19 @@ _IMPORT: Final = re.compile(rb"""(\bfrom|\bimport)(\s*)(["'])([^"'./][^"']*)\3""
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A file as it is sent: compressed."""
+    """A file as it is sent: compressed, where that is wanted. Both are there already, as strangers
+    decide which they ask for."""
 
     content: bytes
+    compressed: bytes
     content_type: str
 
     def answer(self, request: HttpRequest, caching: Headers) -> HttpResponse:
         headers = (("Vary", "Accept-Encoding"), *caching)
         if takes_gzip(request.get("accept-encoding") or ""):
             headers = (("Content-Encoding", "gzip"), *headers)
-            return HttpResponse(200, self.content, self.content_type, headers)
-        return HttpResponse(200, gzip.decompress(self.content), self.content_type, headers)
+            return HttpResponse(200, self.compressed, self.content_type, headers)
+        return HttpResponse(200, self.content, self.content_type, headers)
 
 
 class Console:
@@ -124,7 +126,7 @@ def _read(folder: Path) -> dict[str, _File]:
 
 
 def _file(name: str, content: bytes) -> _File:
-    return _File(gzip.compress(content, mtime=0), _TYPES[Path(name).suffix])
+    return _File(content, gzip.compress(content, mtime=0), _TYPES[Path(name).suffix])
 
 
 def _imports(manifest: bytes) -> dict[str, Mapping[str, str]]:

@@ -292,23 +292,26 @@ async def test_idle_connections_end(harness: WebHarness, monkeypatch: pytest.Mon
     await until(lambda: not harness.scheduler.connections, "the connection to be gone")
 
 
-async def test_a_reader_that_stops(harness: WebHarness):
-    """It is read no more, its memory is counted, and it ends."""
+@pytest.mark.parametrize("tls", [False, True])
+async def test_a_reader_that_stops(harness: WebHarness, tls: bool):
+    """It is read no more, its memory is bounded and counted, and it ends."""
     await harness.start(connect_timeout=1.0)
-    peer = await harness.dial(receive_buffer=4096)
+    peer = await harness.dial(tls, receive_buffer=4096)
     peer.writer.transport.pause_reading()
     await peer.send(GET.replace(b"small", b"large") * 100)
     await until(lambda: harness.requests, "the request")
-    await until(lambda: harness.scheduler.output > len(LARGE) // 4, "its output to be counted")
+    await until(lambda: harness.scheduler.output, "its output to be counted")
+    assert harness.scheduler.output <= 2 * http.BODY_PORTION
     assert harness.broker.accounting.accounts.strangers.output == harness.scheduler.output
     await until(lambda: not harness.scheduler.connections, "the connection to be gone")
     assert len(harness.requests) == 1
     await until(lambda: not harness.scheduler.output, "its output to be given back")
 
 
-async def test_who_is_slow_to_read_gets_all_of_it(harness: WebHarness):
+@pytest.mark.parametrize("tls", [False, True])
+async def test_who_is_slow_to_read_gets_all_of_it(harness: WebHarness, tls: bool):
     await harness.start()
-    peer = await harness.dial(receive_buffer=4096)
+    peer = await harness.dial(tls, receive_buffer=4096)
     await peer.send(GET.replace(b"small", b"large") + GET)
     status, _, body = await answer(peer)
     assert (status, body == LARGE) == (200, True)
