@@ -1,4 +1,4 @@
-# make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884
+# make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443
 # make test  every check: format, lint, types, import directions, tests
 # make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
 #                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
@@ -10,6 +10,7 @@
 PYTHON ?= python3
 PORT ?= 8883
 PLAIN_PORT ?= 1883
+WEB_PORT ?= 8443
 WORKERS ?= 3
 BIN := .venv/bin
 INTEROP := tests/interop/mqttjs
@@ -28,7 +29,8 @@ endif
 .PHONY: run test compiled binary deb
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
-	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) exec $(BIN)/appliance demo -c run/appliance.yaml
+	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) APPLIANCE_WEB_PORT=$(WEB_PORT) \
+	  exec $(BIN)/appliance demo -c run/appliance.yaml
 
 # Most of a test's time is waiting, so three at a time (on two cores); those that compare times come after them, alone.
 # Hundreds of processes are started: each of them compiles all its modules where that is not kept.

@@ -167,7 +167,7 @@ class Site:
         self.home = folder / "home"
         self.folder = self.home / "appliance"
         self.clone = self.home / "clone"
-        self.port, plain_port = free_ports(2)
+        self.port, plain_port, web_port = free_ports(3)
         self.user = USER.get(page.name, "operator")
         self.password = ""
         self.log = folder / "log"
@@ -189,6 +189,7 @@ class Site:
             "DESTDIR": str(image),
             "PORT": str(self.port),  # of `make run`
             "PLAIN_PORT": str(plain_port),
+            "WEB_PORT": str(web_port),
             "APPLIANCE_PORT": str(self.port),
         }
         for each in (programs, self.folder, self.clone / ".venv"):

@@ -30,6 +30,10 @@ def pub(
         bool,
         typer.Option("--lines", "-l", help="Publish each line of standard input as a message."),
     ] = False,
+    repeat: Annotated[
+        int, typer.Option(min=1, help="Publish it so many times, as a client that drives does.")
+    ] = 1,
+    repeat_delay: Annotated[float, typer.Option(min=0, help="Seconds between two of them.")] = 0.0,
     qos: Annotated[
         int, typer.Option("--qos", "-q", min=0, max=2, help="With 1 and 2 a refusal is reported.")
     ] = 1,
@@ -47,10 +51,14 @@ def pub(
         payloads = [file.read_bytes()]
     else:
         payloads = [sys.stdin.buffer.read() if message is None else message.encode()]
+    if repeat > 1:
+        if lines:
+            raise typer.BadParameter("--lines and --repeat exclude each other")
+        payloads = [*payloads] * repeat
     from appliance.cli import mqtt_client as client
 
     try:
-        client.publish(connection.target(), topic, payloads, qos, retain)
+        client.publish(connection.target(), topic, payloads, qos, retain, delay=repeat_delay)
     except client.RefusedError as error:
         raise CommandError(str(error.advised(_EXPLAINED))) from None
     except client.ClientError as error:

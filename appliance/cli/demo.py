@@ -19,6 +19,7 @@ import uvloop
 from appliance.access import Passwords
 from appliance.app.main import App
 from appliance.config import Bind, Settings
+from appliance.host.addresses import own_address
 from appliance.ops.control import ControlError, ask
 from appliance.ops.init import PASSWORD_FILE
 from appliance.ros.ros2.installation import is_frozen
@@ -26,6 +27,10 @@ from appliance.ros.ros2.installation import is_frozen
 RESET = "/reset"  # a service of the demo robot that the demo's configuration bridges
 STOP_TIMEOUT = 5.0  # seconds until the robot is killed
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_ANY = ("", "0.0.0.0", "::")  # hosts of a listener on all addresses
+#: Options that drive, with QoS 0 in both commands. A single command moves nothing, as the stop
+#: message follows when its client leaves.
+DRIVE = """-m '{"linear": {"x": 0.5}, "angular": {"z": 0.3}}' --repeat 40 --repeat-delay 0.05"""
 
 
 class DemoError(Exception):
@@ -64,13 +69,10 @@ class Demo(App):
         self._robot = await _start_robot(self.settings)
         if self._robot is not None:
             self._watching = asyncio.create_task(_watch(self._robot))
-        for listener, (host, port) in zip(
-            self.settings.broker.listeners, self.addresses, strict=True
-        ):
-            if listener.is_mqtts:
-                here = "localhost" if host in ("", "0.0.0.0", "::", "127.0.0.1") else host
-                _say(instructions(self.settings, here, port))
-                break
+        listening = list(zip(self.settings.broker.listeners, self.addresses, strict=True))
+        mqtts = next(address for listener, address in listening if listener.is_mqtts)
+        web = [address for listener, address in listening if listener.is_web_over_tls]
+        _say(instructions(self.settings, mqtts, *web[:1]))
 
     async def stop(self) -> None:
         """Stop the robot, then the appliance; may be called twice."""
@@ -89,8 +91,9 @@ def _check_free(bind: Bind) -> None:
             trial.bind((bind.host, bind.port))
         except OSError as error:
             raise DemoError(
-                f"{bind} cannot be used: {(error.strerror or str(error)).lower()}. Another broker "
-                "may run there; choose other ports: make run PORT=9883 PLAIN_PORT=9884"
+                f"{bind} cannot be used: {(error.strerror or str(error)).lower()}. Another program "
+                "may run there; choose other ports: "
+                "make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443"
             ) from None
 
 
@@ -128,14 +131,20 @@ async def _stop(robot: Process) -> None:
         await robot.wait()
 
 
-def instructions(settings: Settings, host: str, port: int) -> str:
-    """Commands for another terminal to see and drive the robot."""
+def instructions(
+    settings: Settings, mqtts: tuple[str, int], web: tuple[str, int] | None = None
+) -> str:
+    """How to see and drive the robot: in a browser, and with commands in another terminal.
+
+    `mqtts` and `web` are the hosts and ports of listeners with TLS.
+    """
+    (host, port), robot = mqtts, settings.robot
     directory = (settings.file or Path("appliance.yaml")).parent
     user = next(iter(Passwords.load(settings.broker.users).users()), "USER")
     password = directory / PASSWORD_FILE
     shown = f'"$(cat {_quoted(password)})"' if password.exists() else "PASSWORD"
     login = (
-        f"-h {host} -p {port} --cafile {_quoted(settings.broker.tls.ca)} "
+        f"-h {_here(host)} -p {port} --cafile {_quoted(settings.broker.tls.ca)} "
         f"-u {shlex.quote(user)} -P {shown}"
     )
     python = Path(sys.executable)
@@ -144,27 +153,49 @@ def instructions(settings: Settings, host: str, port: int) -> str:
     if port != 8883:  # the other terminal does not have this one's APPLIANCE_PORT
         options += f" -p {port}"
     options += f" --password-file {_quoted(password)}" if password.exists() else ""
-    robot = settings.robot
-    twist = '\'{"linear": {"x": 0.5}, "angular": {"z": 0.3}}\''
     call = ""
     if any(RESET in route.names for route in settings.bridge.services):
         call = (
             f"put it back to its start, by a service of ROS:\n  {command} call {options} {RESET}\n"
         )
     return f"""
-Ready. In another terminal, in this folder:
+Ready.{_console(web, robot, user, password)}
+
+In another terminal, in this folder:
 
 see the robot:
   mosquitto_sub {login} -v -t '{robot}/odom'
-drive it:
-  mosquitto_pub {login} -t '{robot}/cmd_vel' -m {twist}
+drive it, for two seconds; it stops when no command follows:
+  mosquitto_pub {login} -t '{robot}/cmd_vel' {DRIVE}
 
 the same with this project's own command:
   {command} sub {options} -v '{robot}/odom'
-  {command} pub {options} '{robot}/cmd_vel' -m {twist}
+  {command} pub {options} '{robot}/cmd_vel' -q 0 {DRIVE}
 {call}
 Ctrl-C here ends everything.
 """
+
+
+def _console(web: tuple[str, int] | None, robot: str, user: str, password: Path) -> str:
+    """Where the console is, and how to sign in; empty without a listener for the web."""
+    if web is None:
+        return ""
+    host, port = web
+    elsewhere = own_address() if host in _ANY else None
+    phone = "" if elsewhere is None else f"  https://{elsewhere}:{port}/  (from a phone)\n"
+    kept = f"; its password is in {_quoted(password)}" if password.exists() else ""
+    return f""" In a browser:
+
+  https://{_here(host)}:{port}/
+{phone}
+Sign in as {user}{kept}.
+The certificate is this robot's own, so the browser asks whether to trust it. Topics has the
+odometry, {robot}/odom, and Drive moves the robot."""
+
+
+def _here(host: str) -> str:
+    """The host to connect to from this computer."""
+    return "localhost" if host in (*_ANY, "127.0.0.1") else host
 
 
 def _quoted(path: Path) -> str:

@@ -87,12 +87,21 @@ class ConnectionSettings:
 
 
 def publish(
-    target: ConnectionSettings, topic: str, payloads: Iterable[bytes], qos: int, retain: bool
+    target: ConnectionSettings,
+    topic: str,
+    payloads: Iterable[bytes],
+    qos: int,
+    retain: bool,
+    *,
+    delay: float = 0.0,
 ) -> None:
-    """Publish each payload and wait for its acknowledgement. Raises ClientError."""
+    """Publish each payload, wait for its acknowledgement, and between two of them for `delay`
+    seconds. Raises ClientError."""
     connection = MqttClient(target)
     try:
-        for payload in payloads:
+        for number, payload in enumerate(payloads):
+            if number and delay:
+                connection.run(lambda: False, time.monotonic() + delay)
             connection.publish(topic, payload, qos, retain)
     finally:
         connection.close()

@@ -141,6 +141,11 @@ class Listener(_Section):
         """Whether it is MQTT over TLS, without WebSocket."""
         return self.tls and self.protocol == "mqtt"
 
+    @property
+    def is_web_over_tls(self) -> bool:
+        """Whether it has the console, where a browser may ask for a password."""
+        return self.tls and self.protocol == "web"
+
     @field_validator("tls")
     @classmethod
     def _check_tls(cls, tls: bool, info: ValidationInfo) -> bool:

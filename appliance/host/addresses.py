@@ -1,4 +1,4 @@
-"""Network prefixes: what counts as one address where a limit applies to an address."""
+"""Network prefixes, which limits of an address apply to, and this computer's own address."""
 
 from __future__ import annotations
 
@@ -21,3 +21,15 @@ def network_prefix(address: str) -> bytes:
     if packed.startswith(bytes(10) + b"\xff\xff"):  # IPv4, on a listener for both
         return packed[12:]
     return packed[:8]
+
+
+def own_address() -> str | None:
+    """The IPv4 address that other computers most likely reach this one by: that of the interface
+    with the default route. None without such a route."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.connect(("192.0.2.1", 9))  # TEST-NET-1; a UDP socket that connects sends nothing
+        except OSError:
+            return None
+        address: str = trial.getsockname()[0]
+        return address

@@ -35,6 +35,12 @@ CONFIGURATION = """\
 
 robot: {robot}          # the first level of all its MQTT topics
 
+broker:
+  listeners:
+    - {{bind: "0.0.0.0:8883", tls: true}}
+    - {{bind: "127.0.0.1:1883"}}                            # this computer only
+    - {{bind: "0.0.0.0:8443", tls: true, protocol: web}}    # the console, for browsers
+
 bridge:
   discovery: localhost   # ROS nodes of this computer only; subnet lets whoever is on the network
                          # command the robot, past the users and rules of MQTT
@@ -57,6 +63,9 @@ broker:
     - bind: 0.0.0.0:${{APPLIANCE_PORT:-8883}}
       tls: true
     - bind: 127.0.0.1:${{APPLIANCE_PLAIN_PORT:-1883}}
+    - bind: 0.0.0.0:${{APPLIANCE_WEB_PORT:-8443}}
+      tls: true
+      protocol: web
 
 bridge:
   discovery: localhost
@@ -65,7 +74,12 @@ bridge:
     - {{ros: /battery, to: mqtt}}
     - {{ros: /scan, to: mqtt, rate: 2}}
     - {{ros: /chatter, to: mqtt}}
-    - {{ros: /cmd_vel, to: ros, type: geometry_msgs/msg/Twist}}
+    - ros: /cmd_vel
+      to: ros
+      type: geometry_msgs/msg/Twist
+      exclusive: true
+      on_silence: {{after: 500 ms, publish: {{}}}}
+      clamp: {{linear.x: [-0.5, 0.5], angular.z: [-1, 1]}}
   services: [/reset]
 """
 

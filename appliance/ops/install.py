@@ -42,12 +42,15 @@ _TAKEN_OVER = (
     "RMW_IMPLEMENTATION",
 )
 
-_SERVICE_PATHS = f"""
+#: Where the service keeps what it writes, in the first configuration of `init`.
+_SERVICE_STORE = f"""
 broker:
-  store: {{{{path: {DATA}/store.db}}}}
+  store: {{{{path: {DATA}/store.db}}}}"""
+_SERVICE_PATHS = f"""
 control: /run/appliance/control.sock
 crash_reports: {DATA}/crashes
-"""
+
+bridge:"""
 
 #: The line by which the unit of a single file is recognised.
 _SINGLE_FILE = "NotifyAccess=all"
@@ -365,8 +368,7 @@ class ServiceInstaller:
             yield self._configuration_of_another(place)
             _hand_over(place, account, before)
             return
-        text = CONFIGURATION_TEXT.replace("\nbridge:", _SERVICE_PATHS + "\nbridge:", 1)
-        for step in initialise(place, robot=self.robot, configuration=text):
+        for step in initialise(place, robot=self.robot, configuration=first_configuration()):
             if isinstance(step, InitStep):
                 shown = "/" / step.path.relative_to(self.root)
                 yield InstallStep("made" if step.made else "kept", str(shown), step.text)
@@ -560,6 +562,12 @@ def systemd_version() -> int:
         return 0
     words = output.split()
     return int(words[1]) if len(words) > 1 and words[1].isdecimal() else 0
+
+
+def first_configuration() -> str:
+    """The text of a service's first configuration, with `{robot}` in it."""
+    text = CONFIGURATION_TEXT.replace("\nbroker:", _SERVICE_STORE, 1)
+    return text.replace("\nbridge:", _SERVICE_PATHS, 1)
 
 
 def _before(place: Path) -> Path:

@@ -7,7 +7,9 @@ import os
 import shlex
 import shutil
 import socket
+import ssl
 import sys
+import urllib.request
 from asyncio.subprocess import PIPE, Process
 from pathlib import Path
 
@@ -18,13 +20,16 @@ from appliance import config
 from appliance.cli import demo as tour
 from appliance.cli import main as cli
 
+#: The variables with the ports of its listeners.
+PORTS = ("APPLIANCE_PORT", "APPLIANCE_PLAIN_PORT", "APPLIANCE_WEB_PORT")
+
 
 @pytest.fixture
 def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A demo folder, the current one, whose configuration names free ports and no bus."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("APPLIANCE_PORT", "0")
-    monkeypatch.setenv("APPLIANCE_PLAIN_PORT", "0")
+    for name in PORTS:
+        monkeypatch.setenv(name, "0")
     with pytest.raises(SystemExit) as ended:
         cli.main(["init", "--demo", "--dir", "run"])
     assert ended.value.code == 0
@@ -55,6 +60,12 @@ async def output(command: list[str]) -> tuple[int | None, str]:
     return process.returncode, text.decode()
 
 
+def status_of(url: str, ca: Path) -> int:
+    """The status of the page at that URL."""
+    with urllib.request.urlopen(url, context=ssl.create_default_context(cafile=ca)) as answer:
+        return int(answer.status)
+
+
 @pytest.mark.skipif(shutil.which("mosquitto_sub") is None, reason="no mosquitto-clients")
 async def test_what_is_printed_can_be_typed(demo: Path) -> None:
     process = await start("demo", "-c", "run/appliance.yaml")
@@ -62,6 +73,8 @@ async def test_what_is_printed_can_be_typed(demo: Path) -> None:
         printed = [line.strip() for line in await lines_until(process, "Ctrl-C")]
         see = next(line for line in printed if line.startswith("mosquitto_sub"))
         drive = next(line for line in printed if line.startswith("mosquitto_pub"))
+        ours_to_drive = next(line for line in printed if "appliance pub" in line)
+        url = next(line for line in printed if line.startswith("https://"))
         assert any(line.endswith("user.password /reset") for line in printed)
         ours = next(line for line in printed if "appliance sub" in line)
 
@@ -70,6 +83,8 @@ async def test_what_is_printed_can_be_typed(demo: Path) -> None:
         once = see.replace("demo/odom", state) + " -C 1 -W 10"
         assert await output([*shell, once]) == (0, f"{state} online\n")
         assert await output([*shell, drive]) == (0, "")
+        assert await output([*shell, ours_to_drive]) == (0, "")
+        assert await asyncio.to_thread(status_of, url, demo / "run/certs/ca.crt") == 200
 
         words = shlex.split(ours.replace("demo/odom", state))[1:]
         python = [sys.executable, "-m", "appliance"]
@@ -79,12 +94,34 @@ async def test_what_is_printed_can_be_typed(demo: Path) -> None:
         assert await asyncio.wait_for(process.wait(), PATIENCE) == 0
 
 
-def test_a_port_that_is_taken(demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", PORTS)
+def test_a_port_that_is_taken(demo: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     with socket.create_server(("0.0.0.0", 0)) as other:
-        monkeypatch.setenv("APPLIANCE_PORT", str(other.getsockname()[1]))
+        port = other.getsockname()[1]
+        monkeypatch.setenv(name, str(port))
         settings = config.load(demo / "run/appliance.yaml")
-        with pytest.raises(tour.DemoError, match="make run PORT="):
+        with pytest.raises(tour.DemoError, match=rf":{port} cannot .* make run PORT=.* WEB_PORT="):
             tour.run(settings)
+
+
+def test_a_demo_of_before_the_console_has_no_url(demo: Path) -> None:
+    settings = config.load(demo / "run/appliance.yaml")
+    told = tour.instructions(settings, ("0.0.0.0", 8883))
+    assert "https" not in told and "Ready.\n\nIn another terminal" in told
+
+
+def test_where_the_console_is(demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = config.load(demo / "run/appliance.yaml")
+    monkeypatch.setattr(tour, "own_address", lambda: "10.0.0.7")
+    told = tour.instructions(settings, ("0.0.0.0", 8883), ("0.0.0.0", 8443))
+    assert "https://localhost:8443/" in told and "https://10.0.0.7:8443/" in told
+    assert "Sign in as operator; its password is in run/user.password" in told
+    here = tour.instructions(settings, ("127.0.0.1", 8883), ("127.0.0.1", 8443))
+    assert "10.0.0.7" not in here
+    monkeypatch.setattr(tour, "own_address", lambda: None)
+    assert told.count("https://") - 1 == tour.instructions(
+        settings, ("0.0.0.0", 8883), ("0.0.0.0", 8443)
+    ).count("https://")
 
 
 async def test_a_demo_that_runs_already(demo: Path) -> None:

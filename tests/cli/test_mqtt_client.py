@@ -6,6 +6,7 @@ import shutil
 import socket
 import ssl
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -108,6 +109,20 @@ def test_payloads_from_a_file_and_from_lines(
         assert run(peer.arguments("pub", "robot/lines", "-l", "-r", "-q", "2")) == 0
     assert run(peer.arguments("sub", "robot/lines", "-C", "1", "-W", "10")) == 0
     assert capfd.readouterr().out == "two\n"
+
+
+def test_a_message_again_and_again(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:
+    repeated = ("--repeat", "3", "--repeat-delay", "0.1")
+    assert run(peer.arguments("pub", "robot/drive", "-m", "subscribed", "-r")) == 0
+    command = [sys.executable, "-m", "appliance", *peer.arguments("sub", "robot/drive", "-C", "4")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout and process.stdout.readline() == "subscribed\n"
+        begun = time.monotonic()
+        assert run(peer.arguments("pub", "robot/drive", "-m", "go", "-q", "0", *repeated)) == 0
+        assert time.monotonic() - begun >= 0.2
+        assert process.stdout.read() == "go\n" * 3
+    assert run(peer.arguments("pub", "robot/drive", "-l", *repeated)) == 2
+    assert "exclude each other" in capfd.readouterr().err
 
 
 def test_too_few_messages_in_time(peer: Peer, capfd: pytest.CaptureFixture[str]) -> None:

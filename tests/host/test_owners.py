@@ -52,6 +52,12 @@ def home(folder: Path) -> Path:
     return home
 
 
+def audit(file: Path, log: str) -> None:
+    """Turn on the audit log in a configuration that `init` has made."""
+    line = f"\nbroker:\n  audit: {{path: {log}}}"
+    file.write_text(file.read_text().replace("\nbroker:", line, 1))
+
+
 def give(path: Path) -> None:
     for each in (path, *path.rglob("*")):
         os.chown(each, SERVICE, SERVICE, follow_symlinks=False)
@@ -105,11 +111,10 @@ def test_what_is_loaded_late_is_found(home: Path, command: str) -> None:
 def test_links_lead_root_nowhere(home: Path, etc: Path) -> None:
     """The service's user puts them where root's next command writes."""
     where = ["-c", str(home / "appliance.yaml")]
-    text = (home / "appliance.yaml").read_text()
+    audit(home / "appliance.yaml", "audit.log")
     for name in ("users.passwd", "audit.log"):
         (home / name).unlink(missing_ok=True)
         (home / name).symlink_to(etc / "shadow")
-    (home / "appliance.yaml").write_text(f"{text}\nbroker: {{audit: {{path: audit.log}}}}\n")
     give(home)
     assert run("user", "add", "bob", *where, "--generate") == 1
     (home / "users.passwd").unlink()
@@ -132,8 +137,7 @@ def test_a_log_in_the_services_folder_is_written_as_its_user(folder: Path, etc: 
     state, robot = folder / "state", folder / "robot"
     state.mkdir()
     assert run("init", "--dir", str(robot), "--robot", "r2d2") == 0
-    with (robot / "appliance.yaml").open("a") as file:
-        file.write(f"\nbroker: {{audit: {{path: {state}/logs/audit.log}}}}\n")
+    audit(robot / "appliance.yaml", f"{state}/logs/audit.log")
     (state / "logs").mkdir()
     log = state / "logs/audit.log"
     log.touch()

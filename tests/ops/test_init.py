@@ -43,6 +43,9 @@ def test_everything_is_made_and_good(tmp_path: Path) -> None:
     }
     settings = config.load(directory / "appliance.yaml")
     assert settings.robot == "R2-D2"
+    default, web = config.loads("", directory / "x.yaml", {}), settings.broker.listeners[-1]
+    assert settings.broker.listeners[:-1] == default.broker.listeners
+    assert web.is_web_over_tls and str(web.bind) == "0.0.0.0:8443"
     assert [finding for finding in check(settings) if finding.level == "error"] == []
     first = credentials(steps)
     assert Passwords.load(settings.broker.users).verify(first.user, first.password.encode())
@@ -247,10 +250,13 @@ def test_the_demo_keeps_its_password_in_a_file(tmp_path: Path) -> None:
     settings = config.loads(
         (tmp_path / "appliance.yaml").read_text(),
         tmp_path / "appliance.yaml",
-        {"APPLIANCE_PORT": "0", "APPLIANCE_PLAIN_PORT": "1"},
+        {"APPLIANCE_PORT": "0", "APPLIANCE_PLAIN_PORT": "1", "APPLIANCE_WEB_PORT": "2"},
     )
     assert settings.robot == "demo"
-    assert [listener.bind.port for listener in settings.broker.listeners] == [0, 1]
+    assert [listener.bind.port for listener in settings.broker.listeners] == [0, 1, 2]
+    assert settings.broker.listeners[2].is_web_over_tls
+    (drive,) = (route for route in settings.bridge.topics if route.to == "ros")
+    assert drive.on_silence is not None, "the console drives no other route"
     assert {(route.ros, route.to) for route in settings.bridge.topics} == {
         ("/odom", "mqtt"),
         ("/battery", "mqtt"),

@@ -173,12 +173,9 @@ def test_root_makes_nothing_where_the_service_says(image: Path, tmp_path: Path) 
     install(image, single_file(tmp_path))
     home, outside = image / "etc/appliance", tmp_path / "cron.d"
     outside.mkdir()
-    with (home / "appliance.yaml").open("a") as file:
-        file.write(f"broker: {{acl: {outside}/acl, users: {outside}/users}}\n")
-    text = (home / "appliance.yaml").read_text().replace("broker:\n  store", "other:\n  store")
-    (home / "appliance.yaml").write_text(
-        "\n".join(line for line in text.splitlines() if not line.startswith(("other", "  store")))
-    )
+    settings = yaml.safe_load((home / "appliance.yaml").read_text())
+    settings["broker"] = {"acl": f"{outside}/acl", "users": f"{outside}/users"}
+    (home / "appliance.yaml").write_text(yaml.safe_dump(settings))
     (home / "certs/server.crt").unlink()
     (home / "certs").rename(home / "before")
     (home / "certs").symlink_to(outside)
@@ -535,11 +532,11 @@ def test_the_debian_package(tmp_path: Path) -> None:
 
 
 def test_the_first_configuration_is_one(tmp_path: Path) -> None:
-    from appliance.ops.init import CONFIGURATION
-    from appliance.ops.install import _SERVICE_PATHS
+    from appliance.ops.install import first_configuration
 
-    text = CONFIGURATION.replace("\nbridge:", _SERVICE_PATHS + "\nbridge:", 1).format(robot="r2d2")
-    assert yaml.safe_load(text).keys() == {
+    made = yaml.safe_load(first_configuration().format(robot="r2d2"))
+    assert made["broker"].keys() == {"store", "listeners"}
+    assert made.keys() == {
         "robot",
         "broker",
         "control",

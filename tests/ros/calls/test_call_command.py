@@ -224,6 +224,7 @@ async def test_the_demo_s_line_can_be_typed(tmp_path, domain, monkeypatch):
     environment = for_other_programs() | {
         "APPLIANCE_PORT": "0",
         "APPLIANCE_PLAIN_PORT": "0",
+        "APPLIANCE_WEB_PORT": "0",
         "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 101),  # another robot's than the other tests'
     }
 
@@ -246,12 +247,17 @@ async def test_the_demo_s_line_can_be_typed(tmp_path, domain, monkeypatch):
         while b" call " not in line:
             line = await asyncio.wait_for(demo.stdout.readline(), PATIENCE)
             assert line, (await demo.stderr.read()).decode()
+            if b" pub " in line:
+                drive = shlex.split(line.decode())[1:]
         words = shlex.split(line.decode())[1:]
         code, answer, errors = await output(await start(*words))
         while "there is no /reset on the bus" in errors:  # the robot has not come yet
             code, answer, errors = await output(await start(*words))
         assert code == 0, errors
         assert json.loads(answer)["message"] == "was 0.0 m from its start"
+        assert await output(await start(*drive)) == (0, "", "")
+        code, answer, errors = await output(await start(*words))
+        assert json.loads(answer)["message"] > "was 0.3 m", "it has not driven"
     finally:
         demo.terminate()
         await output(demo)
