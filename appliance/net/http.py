@@ -21,13 +21,12 @@ from collections.abc import Awaitable, Coroutine, Iterable
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from http import HTTPStatus
-from typing import Any, Final, Protocol, cast
+from typing import Final, Protocol, cast
 
 import h11
 
-from appliance.broker.accounts import Account
 from appliance.net.callbacks import contained, contained_made
-from appliance.net.layers import LayerScheduler
+from appliance.net.layers import LayerScheduler, MiddleLayer
 from appliance.net.websocket import HEAD_COST, HEAD_LIMIT, PATH, WebSocket, WebSocketHandler
 
 Headers = tuple[tuple[str, str], ...]
@@ -136,19 +135,20 @@ class HttpScheduler(LayerScheduler, Protocol):
         """Run it as a task; it must not raise."""
 
 
-class HttpLayer(asyncio.Transport, asyncio.Protocol):
-    """A protocol for the transport below, and the transport of the `protocol` above.
+class HttpLayer(MiddleLayer):
+    """The layer of HTTP.
 
     `timeout` is in seconds: that long a request may take to come, to be answered, and its answer to
     be read; each for itself.
     """
 
+    _protocol: HttpHandler
+    _scheduler: HttpScheduler
+
     def __init__(
         self, protocol: HttpHandler, scheduler: HttpScheduler, site: HttpSite, timeout: float
     ) -> None:
-        super().__init__()
-        self._protocol = protocol
-        self._scheduler = scheduler
+        super().__init__(protocol, scheduler)
         self._site = site
         self._timeout = timeout
         self._http = h11.Connection(h11.SERVER, max_incomplete_event_size=HEAD_LIMIT)
@@ -161,10 +161,6 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         self._empty = 0
         #: Nothing has come behind the last answer yet.
         self._is_idle = False
-        #: Bytes that TLS below buffers, and those of `_received` that were reported.
-        self._below = 0
-        self._buffered = 0
-        self._queued = False
         #: The answer that waits for a turn.
         self._response: HttpResponse | None = None
         #: The body that is being sent, and how many bytes of it the transport has.
@@ -174,15 +170,7 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         self._busy = False
         self._writing = True
         self._paused = False
-        #: The client sends nothing more.
-        self._hung_up = False
-        #: Another layer has taken over.
-        self._replaced = False
         self._deadline: asyncio.TimerHandle | None = None
-
-    def fault(self, entry: str, error: Exception) -> None:
-        """End this connection because an unexpected exception escaped while it was served."""
-        self._protocol.fault(entry, error)
 
     # --- towards the transport -----------------------------------------------------------------
 
@@ -209,14 +197,7 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
                 self._take_later()
             else:
                 self._take()
-        self._count_received()
-
-    def _count_received(self) -> None:
-        """Report the memory of what was not taken yet."""
-        size = 0 if self._replaced else len(self._received)
-        if size != self._buffered:
-            self._buffered = size
-            self._protocol.count_buffered(self._below + size)
+        self._count_own(len(self._received))
 
     def _limit(self, seconds: float) -> None:
         """Restart the time limit."""
@@ -260,8 +241,6 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
             self._searched = self._empty = 0
             self._scheduler.count_cost(HEAD_COST, self._protocol)
             self._receive_head(head)
-        elif self._hung_up:
-            self._protocol.close()
         else:
             self._read_on()
 
@@ -278,9 +257,9 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         response, self._response = self._response, None
         if response is not None:
             self._answer_counted(response)
-        elif not (self._busy or self._replaced or self._transport.is_closing()):
+        elif not (self._busy or self._transport.is_closing()):
             self._take()
-            self._count_received()
+            self._count_own(len(self._received))
 
     def _pause(self) -> None:
         if not self._paused:
@@ -430,8 +409,6 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         if self._received:
             self._limit(self._timeout)
             self._take_later()
-        elif self._hung_up:
-            self._protocol.close()
         else:
             self._is_idle = True
             self._limit(IDLE_TIMEOUT)
@@ -451,9 +428,8 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
             self._answer(response)
             return
         rest = bytes(self._received)
-        self._replaced = True
         self._received.clear()
-        self._count_received()
+        self._count_own(len(self._received))
         if self._deadline is not None:
             self._deadline.cancel()
         protocol, transport = self._protocol, self._transport
@@ -466,28 +442,6 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         websocket.data_received(head + rest)
 
     # --- what the transport says ---------------------------------------------------------------
-
-    @property
-    def account(self) -> Account:
-        """The account that is charged for what TLS does below."""
-        return self._protocol.account
-
-    def count_buffered(self, size: int) -> None:
-        """TLS below buffers so many bytes."""
-        self._below = size
-        self._protocol.count_buffered(size + self._buffered)
-
-    def input_paused(self) -> None:
-        """Received bytes wait in TLS."""
-        self._protocol.input_paused()
-
-    def input_resumed(self) -> None:
-        """Nothing waits in TLS any more."""
-        self._protocol.input_resumed()
-
-    def partial_record(self, part: bool) -> None:
-        """Whether TLS buffers the beginning of a record."""
-        self._protocol.partial_record(part)
 
     @contained("http.pause")
     def pause_writing(self) -> None:
@@ -507,12 +461,9 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
 
     @contained("http.eof")
     def eof_received(self) -> bool | None:
-        """The client sends nothing more; what it has asked for is answered nevertheless."""
-        self._hung_up = True
-        if self._busy or self._queued:
-            return True
-        self._protocol.eof_received()
-        return False
+        """The client sends nothing more. Reading is paused until all is answered that it has asked
+        for, and so is this."""
+        return self._protocol.eof_received()
 
     @contained("http.lost")
     def connection_lost(self, exc: Exception | None) -> None:
@@ -531,14 +482,6 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         """Close when what was written is read."""
         self._transport.close()
 
-    def abort(self) -> None:
-        """Close at once."""
-        self._transport.abort()
-
-    def is_closing(self) -> bool:
-        """Whether the connection is closed, or closing."""
-        return self._transport.is_closing()
-
     def pause_reading(self) -> None:
         """Take nothing more: the connection closes."""
         self._transport.pause_reading()
@@ -547,18 +490,6 @@ class HttpLayer(asyncio.Transport, asyncio.Protocol):
         """The protocol above need not wait; this layer may have to."""
         if not self._paused:
             self._transport.resume_reading()
-
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
-        """Those of the transport below."""
-        self._transport.set_write_buffer_limits(high, low)
-
-    def get_write_buffer_size(self) -> int:
-        """Bytes that wait in the transport below."""
-        return self._transport.get_write_buffer_size()
-
-    def get_extra_info(self, name: str, default: Any = None) -> Any:
-        """What the transport below knows."""
-        return self._transport.get_extra_info(name, default)
 
 
 def _is_upgrade(request: HttpRequest) -> bool:

@@ -15,9 +15,8 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
-from appliance.broker.accounts import Account
 from appliance.net.callbacks import contained, contained_made
-from appliance.net.layers import LayerScheduler, UpperLayer
+from appliance.net.layers import LayerHandler, LayerScheduler, MiddleLayer
 
 #: The path, and the subprotocols: "mqtt" of the standard, the other one of clients before it.
 PATH = "/mqtt"
@@ -50,26 +49,8 @@ library_log = logging.getLogger(f"{__name__}.frames")
 library_log.setLevel(logging.ERROR)
 
 
-class WebSocketHandler(UpperLayer, Protocol):
-    """The layer above a WebSocket: an `asyncio.Protocol` that is responsible for the connection."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See `asyncio.Protocol`."""
-
-    def data_received(self, data: bytes) -> None:
-        """See `asyncio.Protocol`."""
-
-    def eof_received(self) -> bool | None:
-        """See `asyncio.Protocol`."""
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """See `asyncio.Protocol`."""
-
-    def pause_writing(self) -> None:
-        """See `asyncio.Protocol`."""
-
-    def resume_writing(self) -> None:
-        """See `asyncio.Protocol`."""
+class WebSocketHandler(LayerHandler, Protocol):
+    """The layer above a WebSocket."""
 
     def frame_limit(self) -> int:
         """The largest frame that may be received now, in bytes."""
@@ -77,52 +58,32 @@ class WebSocketHandler(UpperLayer, Protocol):
     def count_partial_frame(self, size: int) -> None:
         """So many bytes of an incomplete frame are buffered."""
 
-    def log_refusal(self, what: str, why: str) -> None:
-        """Log what was refused or ended."""
 
-    def close(self) -> None:
-        """Close the connection; the client was sent the reason."""
-
-    def abort(self) -> None:
-        """Close it at once."""
-
-    def fault(self, entry: str, error: Exception) -> None:
-        """Count an exception that escaped and end the connection; never raises."""
-
-
-class WebSocketLayer(asyncio.Transport, asyncio.Protocol):
-    """A protocol for the transport below, and a transport for the `protocol` above: either side.
+class WebSocketLayer(MiddleLayer):
+    """The layer of a WebSocket, of either side.
 
     The protocol above reads and writes bytes, with the flow control of the transport below. It
     receives a message in the fragments in which it arrives, and none while it has paused reading.
     """
 
+    _protocol: WebSocketHandler
+
     def __init__(
         self, protocol: WebSocketHandler, scheduler: LayerScheduler, frames: FrameProtocol
     ) -> None:
-        super().__init__()
-        self._protocol = protocol
-        self._scheduler = scheduler
-        self._queued = False
+        super().__init__(protocol, scheduler)
         self._frames_left = FRAMES_A_TURN
         self._frames = frames
         #: The head of the HTTP request or response, until it is complete.
         self._head = bytearray()
         #: What was received and is not decoded yet.
         self._backlog = _NOTHING
-        #: Bytes that TLS below buffers, and that are buffered here in addition.
-        self._below = 0
-        self._buffered = 0
         self._reading = True
         self._writing = True
         #: The pong for the last ping, while it cannot be written.
         self._pong = b""
 
     # --- towards the transport -----------------------------------------------------------------
-
-    def fault(self, entry: str, error: Exception) -> None:
-        """End this connection because an unexpected exception escaped while it was served."""
-        self._protocol.fault(entry, error)
 
     @contained_made("websocket.made")
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -143,32 +104,7 @@ class WebSocketLayer(asyncio.Transport, asyncio.Protocol):
 
     def _count_backlog(self) -> None:
         """Report the memory of what is not decoded: of a chunk, all of it."""
-        size = len(cast(bytes, self._backlog.obj)) + len(self._head)
-        if size != self._buffered:
-            self._buffered = size
-            self._protocol.count_buffered(self._below + size)
-
-    @property
-    def account(self) -> Account:
-        """The account that is charged for what TLS does below."""
-        return self._protocol.account
-
-    def count_buffered(self, size: int) -> None:
-        """TLS below buffers so many bytes."""
-        self._below = size
-        self._protocol.count_buffered(size + self._buffered)
-
-    def input_paused(self) -> None:
-        """Received bytes wait in TLS."""
-        self._protocol.input_paused()
-
-    def input_resumed(self) -> None:
-        """Nothing waits in TLS any more."""
-        self._protocol.input_resumed()
-
-    def partial_record(self, part: bool) -> None:
-        """Whether TLS buffers the beginning of a record."""
-        self._protocol.partial_record(part)
+        self._count_own(len(cast(bytes, self._backlog.obj)) + len(self._head))
 
     def _take(self) -> None:
         """Decode what is there, until the turn is over; reading is paused then."""
@@ -305,14 +241,6 @@ class WebSocketLayer(asyncio.Transport, asyncio.Protocol):
             self._send(self._frames.data_to_send())
         self._transport.close()
 
-    def abort(self) -> None:
-        """Close at once."""
-        self._transport.abort()
-
-    def is_closing(self) -> bool:
-        """Whether the connection is closed, or closing."""
-        return self._transport.is_closing()
-
     def pause_reading(self) -> None:
         """Decode nothing until `resume_reading`."""
         self._reading = False
@@ -330,20 +258,12 @@ class WebSocketLayer(asyncio.Transport, asyncio.Protocol):
         """Whether reading is not paused."""
         return self._reading
 
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
-        """Those of the transport below."""
-        self._transport.set_write_buffer_limits(high, low)
-
-    def get_write_buffer_size(self) -> int:
-        """Bytes that wait in the transport below."""
-        return self._transport.get_write_buffer_size()
-
     def get_extra_info(self, name: str, default: Any = None) -> Any:
         """What the transport below knows. `has_unread` is whether either of the two buffers
         received bytes that were not handed on, such as a part of a frame."""
         if name == "has_unread" and (self._backlog or self._frames.reader.buffer):
             return True
-        return self._transport.get_extra_info(name, default)
+        return super().get_extra_info(name, default)
 
 
 class WebSocket(WebSocketLayer):
