@@ -35,11 +35,10 @@ from appliance.ros.graph_follower import FlowKey, GraphFollower, TopicRoutes
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
-from appliance.ros.payload.definitions import UnknownTypeError
 from appliance.ros.payload.encodings.registry import CONTENT_TYPE
-from appliance.ros.payload.schema import json_schema, topic_of
 from appliance.ros.retained_cleanup import RetainedCleanup, TopicOwners
 from appliance.ros.ros2.discovery import TWIN, TWIN_ADVICE
+from appliance.ros.schema_topics import SchemaTopics
 from appliance.ros.skipped import Skipped, ordered, summary
 from appliance.ros.status import (
     RouteStatus,
@@ -92,7 +91,6 @@ DRAIN_AGAIN = 0.05
 BusState: TypeAlias = Literal["waiting", "joined", "lost"]
 
 JSON_PROPERTIES: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE["json"]}
-SCHEMA_PROPERTIES: Properties = {Property.CONTENT_TYPE: "application/schema+json"}
 
 
 class Bridge:
@@ -131,9 +129,7 @@ class Bridge:
         self._entries = entries = Entries(loop, broker.faults)
         self._topic = f"{robot}/_appliance/routes"
         self._skipped_topic = f"{robot}/_appliance/skipped"
-        self._schemas = f"{robot}/_appliance/schema/"
-        #: The types whose schemas are published.
-        self._published_schemas: set[str] = set()
+        self._schemas = SchemaTopics(broker, entries, robot, node.describe)
         self._session: Session | None = None
         self._cleanup = RetainedCleanup(broker, entries)
         self._mailbox = Mailbox(self._wake)
@@ -288,7 +284,7 @@ class Bridge:
         self._broker.departures.append(self._context.staleness.on_departed)
         self._broker.obstacles.append(self._obstacle)
         self.calls.start()
-        self._clear_schemas(self._session)
+        self._schemas.start(self._session)
         self.clean_up_retained()
         self._announce()
         self._meter_timer = self._entries.every("bridge.meter", METER_INTERVAL, self._meter)
@@ -345,6 +341,7 @@ class Bridge:
             pass
         await self.calls.stop()
         self._announce()
+        self._schemas.stop()
         self._cleanup.stop()
         self._session = None
         self._broker.detach(session)
@@ -484,7 +481,7 @@ class Bridge:
         if self._session is not None and payload != self._announced:
             self._announced = payload
             self._publish_retained(self._topic, payload, self._session)
-            self._publish_schemas({topic.type for topic in topics}, self._session)
+            self._schemas.replace((*(topic.type for topic in topics), *self.calls.types()))
             self._broker.flush()
         payload = orjson.dumps(summary(self.skips()))
         if self._session is not None and payload != self._announced_skips:
@@ -513,27 +510,6 @@ class Bridge:
         self._metered += 1
         if self._metered % METERS_TO_ANNOUNCE == 0:
             self._announce()
-
-    def _publish_schemas(self, types: set[str], session: Session) -> None:
-        for name in sorted(types ^ self._published_schemas):
-            payload = b""
-            if name in types:
-                try:
-                    payload = orjson.dumps(json_schema(self._converters.get(name).description))
-                except UnknownTypeError as error:  # which only `cdr` can carry
-                    log.warning("there is no schema of %s: %s", name, error)
-                    continue
-            topic = self._schemas + topic_of(name)
-            self._broker.publish(
-                Message(topic, payload, 0, True, SCHEMA_PROPERTIES if payload else None), session
-            )
-        self._published_schemas = types
-
-    def _clear_schemas(self, session: Session) -> None:
-        """Delete the schemas of a run that was killed: the types may be others now."""
-        for topic, _ in list(self._broker.retained.find(f"{self._schemas}#")):
-            self._broker.publish(Message(topic, b"", 0, True), session)
-        self._broker.flush()
 
     def clean_up_retained(self) -> None:
         """Delete retained messages of routes that are gone, of this run and earlier ones."""

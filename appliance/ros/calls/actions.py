@@ -276,7 +276,7 @@ class ActionRoutes:
             for route, counters in self._counters.items()
         ]
 
-    def bridged(self) -> list[dict[str, str]]:
+    def bridged(self) -> list[dict[str, Any]]:
         """Entries for `{robot}/_appliance/routes`."""
         return [
             {
@@ -285,6 +285,8 @@ class ActionRoutes:
                 "type": action.type or "",
                 "direction": "action",
                 "encoding": action.route.encoding,
+                "timeout": action.route.timeout,
+                "cancel": action.route.cancel,
             }
             for action in self._actions.values()
             if action.is_available

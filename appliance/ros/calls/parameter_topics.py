@@ -206,7 +206,7 @@ class ParameterTopics(ABC, Generic[GroupT]):
             for route, counters in self._counters.items()
         ]
 
-    def bridged(self) -> list[dict[str, str]]:
+    def bridged(self) -> list[dict[str, Any]]:
         """Entries for `{robot}/_appliance/routes`."""
         return [
             {
@@ -215,6 +215,7 @@ class ParameterTopics(ABC, Generic[GroupT]):
                 "type": self.type_name,
                 "direction": "parameters",
                 "encoding": group.route.encoding,
+                "timeout": group.route.timeout,
             }
             for group in self._groups.values()
         ]

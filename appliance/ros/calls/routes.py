@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 from appliance.broker.broker import Broker
 from appliance.broker.faults import Faults
@@ -38,6 +38,14 @@ __all__ = [
 ]
 
 AnySettings: TypeAlias = ServiceSettings | ActionSettings | ParameterSettings
+
+
+#: What the messages of a type are called behind its name, by what `bridged` calls the direction.
+_PARTS: Final = {
+    "service": ("_Request", "_Response"),
+    "provided": ("_Request", "_Response"),
+    "action": ("_Goal", "_Feedback", "_Result"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +210,16 @@ class CallBridge:
         ]
         return [CallStatus(route, tuple(names), counters) for route, counters, names in found]
 
-    def bridged(self) -> list[dict[str, str]]:
+    def types(self) -> list[str]:
+        """The types of requests and responses, goals, feedback and results, for their schemas."""
+        return [
+            entry["type"] + part
+            for entry in (*self._services.bridged(), *self._actions.bridged())
+            for part in _PARTS[entry["direction"]]
+            if entry["type"]
+        ]
+
+    def bridged(self) -> list[dict[str, Any]]:
         """Entries for `{robot}/_appliance/routes`."""
         return [
             *self._services.bridged(),

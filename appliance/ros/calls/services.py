@@ -20,7 +20,7 @@ import secrets
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from appliance.broker.message import Message
 from appliance.broker.session import Session
@@ -229,7 +229,7 @@ class ServiceRoutes:
             for route, counters in self._counters.items()
         ]
 
-    def bridged(self) -> list[dict[str, str]]:
+    def bridged(self) -> list[dict[str, Any]]:
         """Entries for `{robot}/_appliance/routes`."""
         entries = [
             _entry("service", name, endpoint.topic, self._type(name, route), route)
@@ -280,13 +280,14 @@ def _misfit(route: ServiceSettings, types: Sequence[str]) -> tuple[SkipReason, s
 
 def _entry(
     direction: str, ros: str, mqtt: str, type_name: str | None, route: ServiceSettings
-) -> dict[str, str]:
+) -> dict[str, Any]:
     return {
         "ros": ros,
         "mqtt": mqtt,
         "type": type_name or "",
         "direction": direction,
         "encoding": route.encoding,
+        "timeout": route.timeout,
     }
 
 

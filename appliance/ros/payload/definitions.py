@@ -141,11 +141,12 @@ PACKED = Serialization("ros1", b"", 1, b"", b"")
 @dataclass(frozen=True)
 class TypeDescription:
     """A message type: its full name (`geometry_msgs/msg/Twist`), its fields in the order in which
-    they are serialized, and how it and the types in it are serialized."""
+    they are serialized, how it and the types in it are serialized, and its constants."""
 
     name: str
     fields: tuple[Field, ...]
     serialization: Serialization = CDR
+    constants: tuple[tuple[str, bool | int | float | str], ...] = ()
 
 
 ItemType = Primitive | String | WideString | TypeDescription
@@ -255,7 +256,15 @@ def describe(message_class: type, load: Callable[[str], type]) -> TypeDescriptio
     for field_name, slot in zip(names, slots, strict=True):
         type_ = _field_type(slot, load, f"{name}.{field_name}")
         fields.append(Field(field_name, type_, _plain(type_, getattr(example, field_name))))
-    return TypeDescription(name, tuple(fields))
+    return TypeDescription(name, tuple(fields), constants=_constants(message_class))
+
+
+def _constants(message_class: type) -> tuple[tuple[str, bool | int | float | str], ...]:
+    """The constants of a class that rosidl has generated: private to the class of the class."""
+    kind = type(message_class)
+    found = getattr(kind, f"_{kind.__name__}__constants", {})
+    # A byte is bytes of length one.
+    return tuple((key, ord(v) if isinstance(v, bytes) else v) for key, v in found.items())
 
 
 def _field_type(slot: Any, load: Callable[[str], type], where: str) -> FieldType:

@@ -26,7 +26,8 @@ def topic_of(type_name: str) -> str:
 def json_schema(description: TypeDescription) -> dict[str, Any]:
     """The schema of a type, with those of nested types under `$defs`.
 
-    No field is required: a missing field takes its default.
+    No field is required: a missing field takes its default. `x-constants` has the constants of a
+    type, by their names.
     """
     types: dict[str, Any] = {}
     schema = _structure(description, types)
@@ -46,7 +47,9 @@ def _structure(description: TypeDescription, types: dict[str, Any]) -> dict[str,
         properties[field.name] = _value(field.type, types)
         if field.default is not None and not isinstance(field.default, bytes):
             properties[field.name]["default"] = default(field)
-    return {"type": "object", "properties": properties, "additionalProperties": False}
+    schema = {"type": "object", "properties": properties, "additionalProperties": False}
+    constants = {"x-constants": dict(description.constants)} if description.constants else {}
+    return schema | constants
 
 
 def _value(type_: FieldType, types: dict[str, Any]) -> dict[str, Any]:

@@ -86,12 +86,16 @@ def _read(name: str, definition: Path, load: Callable[[str], type]) -> TypeDescr
     if name in outside:
         raise UnknownTypeError(f"no {name}: {definition} contains itself")
     try:
-        fields = parse_message_string(package, type_name, definition.read_text("utf-8")).fields
+        message = parse_message_string(package, type_name, definition.read_text("utf-8"))
     except Exception as error:  # the parser raises many kinds, NameError and AssertionError too
         raise UnknownTypeError(f"no {name}: {definition} cannot be read: {error}") from error
     token = _being_read.set((*outside, name))
     try:
-        return TypeDescription(name, tuple(_field(field, load) for field in fields))
+        return TypeDescription(
+            name,
+            tuple(_field(field, load) for field in message.fields),
+            constants=tuple((each.name, each.value) for each in message.constants),
+        )
     finally:
         _being_read.reset(token)
 

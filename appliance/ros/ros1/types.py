@@ -24,6 +24,7 @@ from appliance.ros.payload.definitions import (
     Field,
     FieldType,
     ItemType,
+    Primitive,
     Sequence,
     String,
     TypeDescription,
@@ -160,6 +161,22 @@ def describe(name: str, text: str) -> TypeDescription:
     return description
 
 
+def _constant(type_name: str, text: str) -> bool | int | float | str | None:
+    """The value of a constant, None where it cannot be read. A text goes on to the line's end."""
+    if type_name == "string":
+        return text.strip()
+    primitive = _BUILT_IN.get(type_name)
+    value = text.partition("#")[0].strip()
+    try:
+        if not isinstance(primitive, Primitive):
+            return None
+        if primitive.name == "bool":
+            return value.lower() in ("true", "1")
+        return float(value) if primitive.is_float else int(value, 0)
+    except ValueError:
+        return None
+
+
 class _Parser:
     def __init__(self, root: str, sections: dict[str, str]) -> None:
         self._root = root
@@ -172,6 +189,7 @@ class _Parser:
         if len(above) > MAX_DEPTH:
             raise self._error(f"it is too deep: more than {MAX_DEPTH} types in types")
         fields: list[Field] = []
+        constants: list[tuple[str, bool | int | float | str]] = []
         count = 1
         for line in text.split("\n"):
             line = line.strip()
@@ -181,7 +199,10 @@ class _Parser:
             if match is None:
                 raise self._error(f"{ros1} has the line {line[:60]!r}")
             type_name, length, field_name, rest = match.groups()
-            if rest and rest.startswith("="):  # a constant
+            if rest and rest.startswith("="):
+                constant = _constant(type_name, rest[1:])
+                if constant is not None:
+                    constants.append((field_name, constant))
                 continue
             item = self._item(type_name, ros1, (*above, ros1))
             type_: FieldType = item
@@ -198,7 +219,7 @@ class _Parser:
                 count += min(int(length), MAX_INLINE_ITEMS) if length else 1
             if count > MAX_FIELDS:
                 raise self._error(f"it has more than {MAX_FIELDS} fields")
-        description = TypeDescription(name, tuple(fields), PACKED)
+        description = TypeDescription(name, tuple(fields), PACKED, tuple(constants))
         self._known[name] = description, count
         return description
 

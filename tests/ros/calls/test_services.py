@@ -392,6 +392,7 @@ async def test_patterns_follow_the_bus(harness):
         "type": SET_BOOL,
         "direction": "service",
         "encoding": "json",
+        "timeout": 5.0,
     } in routes
     other.service.remove()
     node.spin()

@@ -270,6 +270,13 @@ async def test_a_payload_of_another_declared_type_does_not_reach_ros(
 # schemas
 
 
+def test_the_schema_has_the_constants_of_each_type():
+    schema = json_schema(CONVERTERS.get("diagnostic_msgs/msg/DiagnosticArray").description)
+    status = schema["$defs"]["diagnostic_msgs/msg/DiagnosticStatus"]
+    assert status["x-constants"] == {"OK": 0, "WARN": 1, "ERROR": 2, "STALE": 3}
+    assert "x-constants" not in schema
+
+
 def test_the_schema_of_every_field():
     jsonschema = pytest.importorskip("jsonschema")
     converter = CONVERTERS.get("test_msgs/msg/MultiNested")
@@ -312,36 +319,12 @@ def test_a_schema_agrees_with_what_the_converter_accepts(type_name, value):
         assert is_valid
 
 
-async def test_schemas_of_bridged_types_are_retained(harness):
-    harness.start(to_ros("/chatter", type=STRING), to_ros("/cmd_vel", type=TWIST))
-    await harness.settle()
-    retained = harness.broker.retained
-    schema = retained.get("r2d2/_appliance/schema/geometry_msgs/Twist")
-    assert json.loads(schema.payload)["title"] == TWIST
-    assert schema.properties[Property.CONTENT_TYPE] == "application/schema+json"
-    assert retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
-    harness.bridge.replace([to_ros("/cmd_vel", type=TWIST)])
-    harness.node.spin()
-    await harness.settle()
-    assert retained.get("r2d2/_appliance/schema/std_msgs/String") is None
-    assert retained.get("r2d2/_appliance/schema/geometry_msgs/Twist") is not None
-
-
 @pytest.mark.parametrize("name", ["routes", "skipped"])
 async def test_json_of_the_bridge_has_its_content_type(harness, name):
     harness.start(to_ros("/chatter", type=STRING))
     await harness.settle()
     message = harness.broker.retained.get(f"r2d2/_appliance/{name}")
     assert message.properties == {Property.CONTENT_TYPE: "application/json"}
-
-
-async def test_schemas_retained_before_a_crash_are_cleared(harness):
-    topic = "r2d2/_appliance/schema/geometry_msgs/Twist"
-    harness.client.send(topic, b"{}", retain=True)
-    harness.start(to_ros("/chatter", type=STRING))
-    await harness.settle()
-    assert harness.broker.retained.get(topic) is None
-    assert harness.broker.retained.get("r2d2/_appliance/schema/std_msgs/String") is not None
 
 
 # the budget
