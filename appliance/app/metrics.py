@@ -147,10 +147,11 @@ class Metrics:
             found.counter(f"{name}_received_total", f"{about} from clients.", received)
             found.counter(f"{name}_sent_total", f"{about} to clients.", sent)
         found.counter("messages_sent_total", "Messages to clients.", counters.publish_sent)
-        found.counter(
+        found.family(
+            "counter",
             "messages_dropped_total",
-            "Messages that a client was not sent.",
-            counters.publish_dropped,
+            "Messages that were not sent to a client, or not retained, by why.",
+            [(labels(reason=reason), n) for reason, n in counters.dropped.items()],
         )
         found.counter(
             "messages_throttled_total",

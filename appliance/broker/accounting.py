@@ -122,5 +122,5 @@ class Accounting:
         """Whether the message has expired [MQTT-3.3.2-5]; if so, it is counted as dropped."""
         if message.expires_at is None or message.expires_at > self.now:
             return False
-        self.counters.publish_dropped += 1
+        self.counters.drop("expired")
         return True

@@ -520,10 +520,10 @@ class Broker:
         try:
             self._publish_late(will, session)
         except ProtocolError as error:  # the limits are not what they were at its CONNECT
-            self.counters.publish_dropped += 1
+            self.counters.drop("forbidden")
             self.log_rate_limited(session, "its will cannot be published: %s", error)
         except Exception as error:
-            self.counters.publish_dropped += 1
+            self.counters.drop("fault")
             self.faults.caught("broker.will", error, session)
 
     def _publish_late(self, will: PendingWill, session: Session) -> None:
@@ -659,7 +659,8 @@ class Broker:
                 if chosen is not None and self._deliver_shared(chosen, message, share, refusable):
                     taken = True
                 elif published_qos and (asked := next((m[0] for m in members if m[1]), None)):
-                    self.counters.publish_dropped += chosen is None
+                    if chosen is None:
+                        self.counters.drop("queue_full")
                     if store_fails and any(m[1] and m[0].persistent for m in members):
                         is_accepted = False
                     else:
@@ -708,7 +709,7 @@ class Broker:
             return self._not_delivered(session, error)
 
     def _not_delivered(self, session: object, error: Exception) -> bool:
-        self.counters.publish_dropped += 1
+        self.counters.drop("fault")
         self.faults.caught("broker.delivery", error, session)
         return False
 
@@ -837,7 +838,7 @@ class Broker:
         try:
             route = self.router.route(origin, message.topic_wire)
         except ProtocolError as error:  # the limits are not what they were at its PUBREC
-            self.counters.publish_dropped += 1
+            self.counters.drop("forbidden")
             self.log_rate_limited(origin, "its message cannot be published: %s", error)
             return
         self._count_checks(route)

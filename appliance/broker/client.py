@@ -492,7 +492,7 @@ class ClientHandler:
             if not route.allowed or not broker.must_wait_for_disk(route, message, session):
                 return False
             if self._hurries:  # its client has left, and was not told that it had come
-                self._counters.publish_dropped += 1
+                self._counters.drop("not_stored")
                 return True
             self.transport.wait(broker.disk.wait(self))
         # It is counted when it is processed again.
@@ -616,7 +616,7 @@ class ClientHandler:
             and self.broker.must_store(route, message, session)
         ):
             session.unhold(packet_id)
-            self._counters.publish_dropped += 1
+            self._counters.drop("not_stored")
             self._refuse_qos2(packet_id, ReasonCode.QUOTA_EXCEEDED, CANNOT_KEEP)
             return
         if held is not None and not held.message.is_like(message):
@@ -652,7 +652,7 @@ class ClientHandler:
             refuses = self._version == 5 and self.broker.limits.queue_full == "refuse"
             if everybody and refuses:
                 code = ReasonCode.QUOTA_EXCEEDED
-                self._counters.publish_dropped += 1
+                self._counters.drop("queue_full")
             elif not session.hold(
                 packet_id, UnreleasedPublish(message, full, self.transport.now())
             ):

@@ -3,10 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final, Literal, TypeAlias, get_args
 
 #: The cost that one client may cause in one turn of the event loop, see `Counters.cost`: some
 #: milliseconds of work.
 COST_PER_TURN = 1000
+
+#: Why a message was dropped.
+DropReason: TypeAlias = Literal[
+    "queue_full",  # no room in the client's queue, or no memory
+    "replaced",  # a newer one of its topic took its place, for a slow client
+    "expired",  # it waited too long
+    "too_large",  # larger than the client takes
+    "forbidden",  # by the rules or limits that are in force meanwhile
+    "not_stored",  # the store has no room for it, or fails
+    "not_retained",  # no room among the retained messages; it was delivered
+    "fault",  # of the appliance
+]
+
+DROP_REASONS: Final[tuple[DropReason, ...]] = get_args(DropReason)
 
 
 @dataclass(slots=True)
@@ -19,7 +34,8 @@ class Counters:
     control_sent: int = 0
     publish_received: int = 0
     publish_sent: int = 0
-    publish_dropped: int = 0
+    dropped: dict[DropReason, int] = field(default_factory=lambda: dict.fromkeys(DROP_REASONS, 0))
+    last_drop: DropReason = "queue_full"
     #: Messages that a newer one replaced because of a subscription's max-rate.
     publish_throttled: int = 0
     publish_refused: int = 0
@@ -41,6 +57,20 @@ class Counters:
     #: `Broker._make_room`.
     evicted: int = 0
     clients_maximum: int = 0
+
+    def drop(self, reason: DropReason) -> None:
+        """Count a message that is dropped for this reason."""
+        self.dropped[reason] += 1
+        self.last_drop = reason
+
+    def take_back_drop(self) -> None:
+        """The message that was counted last is kept after all."""
+        self.dropped[self.last_drop] -= 1
+
+    @property
+    def publish_dropped(self) -> int:
+        """Messages that were dropped, for whatever reason."""
+        return sum(self.dropped.values())
 
     @property
     def connects_refused(self) -> int:

@@ -25,6 +25,7 @@ from collections.abc import Callable
 from typing import Protocol, TypeAlias, cast
 
 from appliance.broker.accounting import Accounting
+from appliance.broker.counters import DropReason
 from appliance.broker.delivery import Delivery
 from appliance.broker.link import Link
 from appliance.broker.message import Message
@@ -107,7 +108,7 @@ class RatedSession(Protocol):
     def is_wanted_still(self, message: Message) -> bool:
         """Whether a message that has waited may be sent; if not, it is counted as dropped."""
 
-    def drop(self, message: Message) -> None:
+    def drop(self, message: Message, reason: DropReason) -> None:
         """Count a message that is dropped because there is no room."""
 
 
@@ -369,7 +370,7 @@ class RateLimit:
             self._throttled(topic)
         limit = self._accounting.limits.queue_messages
         if session.rated >= limit or not self._has_room(message.size):
-            session.drop(message)
+            session.drop(message, "queue_full")
             return False
         message.settle()
         session.take(message.size)

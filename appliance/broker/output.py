@@ -123,7 +123,7 @@ class Output:
             first |= 8
         version = self.version
         if self._checks_each and self._is_refused(first, message, subscription_ids):
-            self._counters.publish_dropped += 1
+            self._counters.drop("too_large")
             if qos and self.session is not None:  # [MQTT-3.1.2-25]: as if it were acknowledged
                 self.session.give_up(packet_id)
             return

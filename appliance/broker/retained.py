@@ -108,7 +108,7 @@ class RetainedMessages:
             message.settle()
             shortage = self._shortage(message, old, owner)
             if shortage:
-                self._accounting.counters.publish_dropped += 1
+                self._accounting.counters.drop("not_retained")
                 self._log_no_room(message, owner, shortage)
                 return False
             self._put(message, owner)

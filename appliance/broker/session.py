@@ -11,6 +11,7 @@ from typing import Any, cast
 
 from appliance.broker.accounting import Accounting
 from appliance.broker.backpressure import Congestion
+from appliance.broker.counters import DropReason
 from appliance.broker.delivery import Delivery, Group, PendingWill, UnreleasedPublish, held_size
 from appliance.broker.link import Link
 from appliance.broker.max_rate import RateLimit, RateSchedule
@@ -258,7 +259,7 @@ class Session:
         if accounting.limits.queue_full == "disconnect" and link is not None:
             accounting.overflowed.append(self)
         self._report_full(size)
-        self.drop(message)
+        self.drop(message, "queue_full")
         return False
 
     def deliver_promised(self, delivery: Delivery) -> None:
@@ -268,7 +269,7 @@ class Session:
         publishers have between PUBREC and PUBREL.
         """
         if not self.deliver(*delivery):
-            self.accounting.counters.publish_dropped -= 1
+            self.accounting.counters.take_back_drop()
             self._enqueue(delivery, promised=True)
 
     def has_room(self, message: Message, refusable: bool = True) -> bool:
@@ -295,7 +296,7 @@ class Session:
             if not promised and not self._may_store(message, refusable):
                 if not (refusable and self.accounting.failing):
                     self._report_full(message.size)
-                self.accounting.counters.publish_dropped += 1
+                self.accounting.counters.drop("not_stored")
                 return False
             self._depend_on_batch()
             self.accounting.store.queued(self, delivery)
@@ -324,7 +325,7 @@ class Session:
             oldest = self.queue.popleft()
             self._uncount(oldest[0])
             self._settled(oldest)
-            self.drop(oldest[0])
+            self.drop(oldest[0], "queue_full")
         return self.fits(message.size)
 
     def replay(self, topic_filter: str, deliveries: Iterator[Delivery | None]) -> None:
@@ -432,7 +433,7 @@ class Session:
                 if is_old(delivery[0]):
                     self._uncount(delivery[0])
                     self._settled(delivery)
-                    self.drop(delivery[0])
+                    self.drop(delivery[0], "expired")
             self.queue = remaining
             if self.congestion is not None:
                 self._relieve(self.congestion)
@@ -521,7 +522,7 @@ class Session:
 
     def _cannot_be_sent(self, error: Exception, packet_id: int = 0) -> None:
         """Drop a message whose sending failed, so that it does not block the queue."""
-        self.accounting.counters.publish_dropped += 1
+        self.accounting.counters.drop("fault")
         self.accounting.faults.caught("session.send", error, self)
         if packet_id:
             self.give_up(packet_id)
@@ -541,7 +542,7 @@ class Session:
         """Whether changed rules forbid a queued message; if so, it is counted as dropped."""
         if not self.unchecked or self.accounting.may_still_receive(self, message.topic):
             return False
-        self.accounting.counters.publish_dropped += 1
+        self.accounting.counters.drop("forbidden")
         return True
 
     def is_wanted_still(self, message: Message) -> bool:
@@ -554,7 +555,7 @@ class Session:
             return False
         if accounting.may_still_receive(self, message.topic):
             return True
-        accounting.counters.publish_dropped += 1
+        accounting.counters.drop("forbidden")
         return False
 
     def keep_latest(self, delivery: Delivery) -> bool:
@@ -571,7 +572,7 @@ class Session:
             replaced = self.latest.pop(key, None) or self.large.pop(key, None)
         if replaced is not None:
             self._uncount(replaced[0])
-            self.drop(replaced[0])
+            self.drop(replaced[0], "queue_full" if limits.keep else "replaced")
         room = limits.keep or len(self.latest) + len(self.large) < limits.queue_messages
         if room and self.fits(message.size):
             message.settle()
@@ -579,7 +580,7 @@ class Session:
             is_large = message.size > LARGE_MESSAGE and not limits.keep
             (self.large if is_large else self.latest)[key] = delivery
             return True
-        self.drop(message)
+        self.drop(message, "queue_full")
         return False
 
     def overtake(self, topic: str) -> None:
@@ -587,7 +588,7 @@ class Session:
         waiting = self.large.pop(topic, None)
         if waiting is not None:
             self._uncount(waiting[0])
-            self.drop(waiting[0])
+            self.drop(waiting[0], "replaced")
 
     def _report_full(self, size: int) -> None:
         """Have the full queue logged once in an absence: nobody else notices the lost messages."""
@@ -595,9 +596,9 @@ class Session:
             self.is_full_logged = True
             self.accounting.filled.append((self, self.shortage(size)))
 
-    def drop(self, message: Message) -> None:
+    def drop(self, message: Message, reason: DropReason) -> None:
         """Count a message that is dropped because the client is too slow."""
-        self.accounting.counters.publish_dropped += 1
+        self.accounting.counters.drop(reason)
         message.dropped()
 
     def _count(self, message: Message) -> None:

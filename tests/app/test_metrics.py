@@ -112,11 +112,13 @@ async def test_guesses_are_throttled_with_those_of_mqtt(
     web: WebApp, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     access = web.app._login._files
+    began = time.monotonic()
+    monkeypatch.setattr(access.throttle, "_clock", lambda: began)  # a failure drains in two seconds
     assert (await web.get("/metrics", **RIGHT))[0] == 200
     for number in range(3):
         assert (await web.get("/metrics", **basic("operator", f"swordfish-{number}")))[0] == 401
     failures = access.throttle._networks
-    assert [round(each.level) for each in failures.values()] == [3]
+    assert [each.level for each in failures.values()] == [3]
     monkeypatch.setattr(access.throttle, "reserve", lambda *arguments: None)
     status, headers, _ = await web.get("/metrics", **basic("operator", "swordfish"))
     assert (status, headers["retry-after"]) == (503, "5")
@@ -179,10 +181,13 @@ async def test_what_it_says_of_the_broker(web: WebApp):
     before = found["appliance_messages_received_total", "client"]
     web.app.broker.counters.publish_received += 5
     web.app.broker.counters.refuse(0x87)
+    web.app.broker.counters.drop("too_large")
     await web.get("/metrics", **basic("operator", "wrong"))
     found = await scrape(web, tls=False)
     assert found["appliance_messages_received_total", "client"] == before + 5
     assert found["appliance_connects_refused_total", "not_authorized"] == 1
+    assert found["appliance_messages_dropped_total", "too_large"] == 1
+    assert found["appliance_messages_dropped_total", "queue_full"] == 0
     assert found["appliance_logins_failed_total",] == 1
     await until(lambda: sum(web.app._lag.counts), "a tick of the clock")
     assert (await scrape(web))["appliance_loop_lag_seconds_count",] >= 1

@@ -459,6 +459,11 @@ def lasting(version: int, seconds: int = 3600) -> dict[str, object]:
     return {"clean": False}
 
 
+def drops(broker: Broker) -> dict[str, int]:
+    """How many messages were dropped, by why."""
+    return {reason: count for reason, count in broker.counters.dropped.items() if count}
+
+
 def waiting_bytes(broker: Broker) -> int:
     """What the broker has counted for messages that wait: subscriptions and wills not among it."""
     rest = sum(

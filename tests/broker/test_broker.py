@@ -26,7 +26,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import ALONE, FakeAccess, FakeStore, Join, Peer, lasting, waiting_bytes
+from .conftest import ALONE, FakeAccess, FakeStore, Join, Peer, drops, lasting, waiting_bytes
 
 EXPIRY = Property.SESSION_EXPIRY_INTERVAL
 MESSAGE_EXPIRY = Property.MESSAGE_EXPIRY_INTERVAL
@@ -433,7 +433,7 @@ def test_the_number_of_retained_messages_is_bounded(join: Join, broker: Broker):
     publisher.publish("a", b"", 1, retain=True)
     publisher.publish("c", b"3", 1, retain=True)
     assert {m.topic: m.payload for m in retained(broker, 5)} == {"b": b"1", "c": b"3"}
-    assert broker.counters.publish_dropped == 1
+    assert drops(broker) == {"not_retained": 1}
 
 
 @pytest.mark.parametrize("limits", [Limits(retained_messages=1, user=ALONE)])
@@ -944,7 +944,7 @@ def test_changed_rules_hold_for_what_waits(join: Join, access: FakeAccess, broke
     broker.rules_changed()
     subscriber.fast()
     assert [m.topic for m in subscriber.drain()] == ["open", "open"]
-    assert broker.counters.publish_dropped == 2
+    assert drops(broker) == {"forbidden": 2}
 
 
 def test_changed_rules_hold_for_what_is_in_flight_to_an_absent_client(
@@ -1033,7 +1033,7 @@ def test_the_queue_is_bounded_in_messages(join: Join, broker: Broker):
     publisher = join("publisher")
     codes = [publisher.publish("a", b"%d" % n, 1) for n in range(9)]
     assert codes == [0] * 7 + [ReasonCode.QUOTA_EXCEEDED] * 2
-    assert broker.counters.publish_dropped == 2
+    assert drops(broker) == {"queue_full": 2}
     assert [m.payload for m in subscriber.drain()] == [b"%d" % n for n in range(7)]
     subscriber.lose()
     codes = [publisher.publish("a", b"%d" % n, 2) for n in range(9)]

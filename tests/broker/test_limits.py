@@ -33,7 +33,7 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import ALONE, FakeAccess, Join, Peer, lasting, waiting_bytes
+from .conftest import ALONE, FakeAccess, Join, Peer, drops, lasting, waiting_bytes
 
 SMALL = {"queue_messages": 3, "inflight": 1}
 
@@ -132,7 +132,7 @@ def test_a_queue_of_n_keeps_the_newest_n_in_order(join: Join, broker: Broker):
     fill(join("publisher"), 8, 0)
     subscriber.fast()
     assert subscriber.payloads() == [b"5", b"6", b"7"]
-    assert broker.counters.publish_dropped == 5 and waiting_bytes(broker) == 0
+    assert drops(broker) == {"queue_full": 5} and waiting_bytes(broker) == 0
 
 
 # --- memory

@@ -15,7 +15,7 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Publish, Suback, Subscribe, Subscription, Unsubscribe
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import FakeAccess, Join, Peer, check_accounts, lasting, waiting_bytes
+from .conftest import FakeAccess, Join, Peer, check_accounts, drops, lasting, waiting_bytes
 
 
 def rate(value: str, **more: object) -> Properties:
@@ -192,6 +192,7 @@ def test_a_message_that_expires_while_it_waits_is_dropped(broker: Broker, join: 
     publisher.publish("a", b"2", properties=expiry)
     passes(broker, 10.1)
     assert reader.payloads() == [b"1"] and waiting_bytes(broker) == 0
+    assert drops(broker) == {"expired": 1}
 
 
 @pytest.mark.parametrize("how", ["unsubscribe", "lose", "end"])

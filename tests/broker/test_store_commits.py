@@ -8,7 +8,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.mqtt.packets import Puback, Pubcomp, Publish, Pubrec, Pubrel
 
-from .conftest import FakeStore, Join, Peer, lasting
+from .conftest import FakeStore, Join, Peer, drops, lasting
 from .test_broker import FakeLink
 
 
@@ -116,12 +116,15 @@ def failing(join: Join, store: FakeStore, version: int = 5) -> tuple[Peer, Peer]
 
 
 @pytest.mark.parametrize("qos", [1, 2])
-def test_what_cannot_be_stored_is_refused(join: Join, store: FakeStore, qos: int):
+def test_what_cannot_be_stored_is_refused(
+    join: Join, broker: Broker, store: FakeStore, qos: int
+) -> None:
     subscriber, publisher = failing(join, store)
     other = join("other", **lasting(5))  # a session can be made, and is stored later
     other.subscribe("b", 1)
     assert publisher.publish("a", qos=qos) == 0x97
     assert publisher.publish("new", qos=qos, retain=True) == 0x97
+    assert set(drops(broker)) == {"not_stored"}
     assert publisher.publish("nobody", qos=qos) in (0, 0x10)
     assert publisher.publish("a", b"0") == 0
     assert subscriber.payloads() == [b"0"]
