@@ -1,9 +1,10 @@
 """A small robot to try the bridge with: `python -m appliance.cli.demo_robot`.
 
 It follows `/cmd_vel` and stops when no command has come for a second. It publishes `/odom`,
-`/battery`, `/scan`, `/chatter` and, latched, `/robot_description`. The service `/reset`
-(std_srvs/srv/Trigger) puts it back to its start. Units as in REP 103: m, rad, s, V. SIGTERM and
-SIGINT stop it.
+`/battery`, `/scan`, `/chatter`, while somebody subscribes `/camera/image_raw`, and, latched, `/map`
+and `/robot_description`. Its odometry is exact, so that the map is in the frame `odom`. The service
+`/reset` (std_srvs/srv/Trigger) puts it back to its start. Units as in REP 103: m, rad, s, V.
+SIGTERM and SIGINT stop it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from appliance.ros.ros2.node import available
 COMMAND_TIMEOUT = 1.0  # seconds
 ODOMETRY_RATE = 20.0  # Hz
 SCAN_RATE = 5.0  # Hz
-ROOM = 4.0  # m, the side of the square room that the laser scanner sees
+ROOM = 4.0  # m, the side of the square room that the laser scanner and the camera see
+CAMERA_RATE = 5.0  # Hz
 SCAN_POINTS = 360
 FULL, EMPTY = 12.6, 10.0  # V
 FULL_CHARGE_LASTS = 3600.0  # seconds
@@ -34,8 +36,10 @@ TWIST = "geometry_msgs/msg/Twist"
 ODOMETRY = "nav_msgs/msg/Odometry"
 BATTERY = "sensor_msgs/msg/BatteryState"
 SCAN = "sensor_msgs/msg/LaserScan"
+IMAGE = "sensor_msgs/msg/Image"
+GRID = "nav_msgs/msg/OccupancyGrid"
 STRING = "std_msgs/msg/String"
-TYPES = (TWIST, ODOMETRY, BATTERY, SCAN, STRING)
+TYPES = (TWIST, ODOMETRY, BATTERY, SCAN, IMAGE, GRID, STRING)
 
 DESCRIPTION = """<robot name="demo">
   <link name="base_link">
@@ -93,9 +97,12 @@ class DemoRobot:
     def __init__(self, node: Any) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 
+        from appliance.cli import demo_scene
+
         # Imported by name, because these packages have no types for mypy.
         self._types = {name: import_message(name) for name in TYPES}
-        twist, odometry, battery, scan, string = self._types.values()
+        twist, odometry, battery, scan, image, grid, string = self._types.values()
+        self._scene = demo_scene
         self._node = node
         self._drive = Drive()
         self._started = monotonic()
@@ -108,11 +115,15 @@ class DemoRobot:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._description = node.create_publisher(string, "/robot_description", latched)
         self._description.publish(string(data=DESCRIPTION))
+        self._camera = node.create_publisher(image, "/camera/image_raw", qos_profile_sensor_data)
+        self._map = node.create_publisher(grid, "/map", latched)
+        self._publish_map()
         node.create_subscription(twist, "/cmd_vel", self._on_command, 10)
         trigger = import_module("std_srvs.srv").Trigger
         node.create_service(trigger, "/reset", self._on_reset)
         node.create_timer(1 / ODOMETRY_RATE, self._publish_odometry)
         node.create_timer(1 / SCAN_RATE, self._publish_scan)
+        node.create_timer(1 / CAMERA_RATE, self._publish_picture)
         node.create_timer(1.0, self._publish_battery_and_chatter)
 
     def _on_command(self, twist: Any) -> None:
@@ -154,6 +165,25 @@ class DemoRobot:
         message.range_max = 2 * ROOM
         message.ranges = self._drive.scan()
         self._scan.publish(message)
+
+    def _publish_picture(self) -> None:
+        if not self._camera.get_subscription_count():
+            return
+        scene, drive = self._scene, self._drive
+        message = self._new(IMAGE, "camera")
+        message.width, message.height = scene.WIDTH, scene.HEIGHT
+        message.encoding, message.step = "rgb8", 3 * scene.WIDTH
+        message.data = scene.picture(ROOM, drive.x, drive.y, drive.heading, monotonic())
+        self._camera.publish(message)
+
+    def _publish_map(self) -> None:
+        message = self._new(GRID, "odom")
+        info, cells = message.info, self._scene.map_cells(ROOM)
+        info.resolution = self._scene.RESOLUTION
+        info.width = info.height = math.isqrt(len(cells))
+        info.origin.position.x = info.origin.position.y = self._scene.map_corner(ROOM)
+        message.data = cells
+        self._map.publish(message)
 
     def _publish_battery_and_chatter(self) -> None:
         message = self._new(BATTERY, "base_link")

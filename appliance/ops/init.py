@@ -74,6 +74,8 @@ bridge:
     - {{ros: /battery, to: mqtt}}
     - {{ros: /scan, to: mqtt, rate: 2}}
     - {{ros: /chatter, to: mqtt}}
+    - {{ros: /camera/image_raw, to: mqtt, encoding: jpeg, rate: 5}}
+    - {{ros: /map, to: mqtt, encoding: cbor}}
     - ros: /cmd_vel
       to: ros
       type: geometry_msgs/msg/Twist

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
-import os
 import re
-import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,50 +12,13 @@ from typing import Any
 import psutil
 import pytest
 from appliance_process import ROBOT, ApplianceProcess
-from cryptography import x509
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from interop.paho_peer import V5, Peer
-from npm_packages import DIRECTORY, install
-from ros_domain import DOMAIN
-from waiting import PATIENCE, eventually
+from visits import DESKTOP, PHONE, Visit, wait_for_change
+from waiting import eventually
 
 pytest.importorskip("rclpy")
-sync_api = pytest.importorskip("playwright.sync_api")
+pytest.importorskip("playwright.sync_api")
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
-
-ACL = """\
-pattern read $CONTROL/appliance/v1/+/_reply/%c/#
-
-user alice
-topic readwrite {robot}/#
-topic read $SYS/#
-topic write $CONTROL/appliance/v1/+/_call/#
-
-user viewer
-topic read {robot}/#
-"""
-PASSWORD = "only-to-look-at-1"
-
-BRIDGE = {
-    "discovery": "localhost",
-    "topics": [
-        {"ros": "/odom", "to": "mqtt", "rate": 10},
-        {
-            "ros": "/cmd_vel",
-            "to": "ros",
-            "type": "geometry_msgs/msg/Twist",
-            "exclusive": True,
-            "on_silence": {"after": "500 ms", "publish": {}},
-            "clamp": {"linear.x": [-0.25, 0.5], "angular.z": [-1, 1]},
-        },
-        {"ros": "/other/cmd_vel", "to": "ros", "type": "geometry_msgs/msg/TwistStamped"},
-    ],
-}
-PHONE = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
-DESKTOP = {"viewport": {"width": 1280, "height": 800}}
-#: Where pictures of the pages go, when somebody wants to look at them.
-PICTURES = os.environ.get("CONSOLE_PICTURES")
 RIGHTS = json.dumps({"questions": [{"action": "publish", "topic": f"{ROBOT}/cmd_vel"}]})
 SPEED = 0.1  # m/s; above it the robot drives, by the console's 50 % of the clamp
 
@@ -89,134 +46,12 @@ class Odometry:
 
 
 @pytest.fixture(scope="module")
-def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
-    bind = "127.0.0.1:0"
-    web = {"bind": bind, "protocol": "web"}
-    listeners = [{"bind": bind, "tls": True}, {"bind": bind}, {**web, "tls": True}, web]
-    process = ApplianceProcess(
-        tmp_path_factory.mktemp("console"),
-        users={"viewer": PASSWORD},
-        acl=ACL,
-        broker={"listeners": listeners},
-        bridge=BRIDGE,
-    )
-    bus = {"ROS_DOMAIN_ID": DOMAIN, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    process.environment = bus
-    process.start()
-    robot = subprocess.Popen(
-        [sys.executable, "-m", "appliance.cli.demo_robot"], env={**os.environ, **bus}
-    )
-    yield process
-    robot.terminate()
-    robot.wait(PATIENCE)
-    process.stop()
-
-
-@pytest.fixture(scope="module")
 def odometry(appliance: ApplianceProcess) -> Iterator[Odometry]:
     odometry = Odometry(appliance)
     with odometry.peer as peer:
         peer.subscribe(f"{ROBOT}/odom")
         eventually(lambda: odometry.count > 0, "the robot's odometry")
         yield odometry
-
-
-@pytest.fixture(scope="module")
-def origin(appliance: ApplianceProcess) -> str:
-    lines = appliance.wait_for_log(r"listening for the web on \S+:(\d+)$", 2)
-    return f"https://localhost:{lines[0].rpartition(':')[2]}"
-
-
-@pytest.fixture(scope="module")
-def browser(appliance: ApplianceProcess) -> Iterator[Any]:
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium: apt-get install chromium")
-    certificate = (appliance.directory / "certs/server.crt").read_bytes()
-    key = x509.load_pem_x509_certificate(certificate).public_key()
-    digest = hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo))
-    trusted = base64.b64encode(digest.digest()).decode()
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM,
-            timeout=PATIENCE * 1000,
-            args=[
-                "--no-sandbox",
-                "--disable-gpu",
-                "--disable-dev-shm-usage",
-                f"--ignore-certificate-errors-spki-list={trusted}",
-            ],
-        )
-        yield browser
-        browser.close()
-
-
-class Visit:
-    """A browser's window at the console, and all that went wrong in it."""
-
-    def __init__(self, browser: Any, origin: str, passwords: dict[str, str], options: Any) -> None:
-        self._context = browser.new_context(**options)
-        self._context.set_default_timeout(PATIENCE * 1000)
-        self._passwords = passwords
-        self.page = self._context.new_page()
-        self.wrong: list[str] = []
-        self.requests: list[str] = []
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.on("requestfailed", lambda request: self.wrong.append(f"failed: {request.url}"))
-        self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on("dialog", lambda dialog: (self.wrong.append(dialog.message), dialog.dismiss()))
-        self.page.on("console", self._said)
-        self.page.goto(origin)
-
-    def _said(self, message: Any) -> None:
-        if message.type == "error":
-            self.wrong.append(message.text)
-
-    def sign_in(self, user: str = "alice", page: str = "") -> Any:
-        self.page.fill("input[name=user]", user)
-        self.page.fill("input[name=password]", self._passwords[user])
-        self.page.click("form button")
-        self.page.wait_for_selector("nav")
-        if page:
-            self.page.click(f"nav a:has-text('{page}')")
-        return self.page
-
-    def look(self, name: str) -> None:
-        """Have axe look at the page, and keep a picture where that is wanted."""
-        if PICTURES:
-            self.page.screenshot(path=f"{PICTURES}/{name}.png", full_page=True)
-        axe = (DIRECTORY / "node_modules/axe-core/axe.min.js").read_text()
-        self.page.evaluate(axe)
-        found = self.page.evaluate(
-            "axe.run({runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']})"
-        )
-        told = [
-            (each["id"], [node["html"] for node in each["nodes"]]) for each in found["violations"]
-        ]
-        assert told == [], name
-
-    def close(self) -> None:
-        self._context.close()
-
-
-@pytest.fixture
-def visit(browser: Any, origin: str, appliance: ApplianceProcess) -> Iterator[Callable[..., Visit]]:
-    install()
-    visits: list[Visit] = []
-
-    def begin(**options: Any) -> Visit:
-        visits.append(Visit(browser, origin, appliance.passwords, options))
-        return visits[-1]
-
-    yield begin
-    for each in visits:
-        each.close()
-    assert [wrong for each in visits for wrong in each.wrong] == []
-
-
-def wait_for_change(page: Any, place: str) -> None:
-    """Return when there is another text at a place of the page."""
-    first = page.inner_text(place)
-    eventually(lambda: page.inner_text(place) != first, "another value")
 
 
 def hold(page: Any, *, x: float = 0.5, y: float = 0.02) -> None:

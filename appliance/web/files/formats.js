@@ -1,18 +1,19 @@
 // What a payload says, as plain text: never markup, never an object with the payload's own keys.
 // Runs in the worker. All sizes are bounded; what is longer is cut, and says so.
 
+import { checkedPicture, pictureType } from './pictures.js'
+
 export const LEAVES = 1000 // values of one message that are shown
 const DEPTH = 64
 const TEXT = 64 * 1024 // characters of a text
 const VALUE = 2000 // characters of one value
 const HEX = 4096 // bytes of a hex dump
 const INFLATED = 10 * 1024 * 1024 // bytes that a compressed payload may have
-const IMAGES = new Set(['image/jpeg', 'image/png', 'image/webp'])
 
 let cbor = null
 let zstd = null
 
-async function loadCbor() {
+export async function loadCbor() {
   cbor ??= (await import('./vendor/cborg/lib/decode.js')).decode
   return cbor
 }
@@ -48,7 +49,7 @@ export function preview(payload, properties) {
     }
     return `CBOR, ${size(payload.length)}`
   }
-  if (type.startsWith('image/') || isJpeg(payload) || isPng(payload)) return `picture, ${size(payload.length)}`
+  if (type.startsWith('image/') || pictureType(payload)) return `picture, ${size(payload.length)}`
   const head = payload.subarray(0, 480)
   if (type === '' || type.startsWith('text/') || type.endsWith('json')) {
     const text = new TextDecoder().decode(head)
@@ -79,8 +80,12 @@ export async function decode(payload, properties) {
 
 async function show(bytes, type) {
   if (bytes.length === 0) return { kind: 'text', note: 'empty', text: '' }
-  if (IMAGES.has(type) || isJpeg(bytes) || isPng(bytes)) {
-    return { kind: 'image', note: type, picture: new Blob([bytes], { type: type || 'image/png' }) }
+  if (pictureType(bytes)) {
+    try {
+      return { kind: 'image', note: type, picture: checkedPicture(bytes) }
+    } catch (error) {
+      return { kind: 'hex', note: error.message, text: hexDump(bytes) }
+    }
   }
   if (type === 'application/cbor') {
     try {
@@ -163,28 +168,33 @@ function next(level) {
 }
 
 const ARRAYS = {
-  64: [Uint8Array, 1, 'getUint8'], 68: [Uint8Array, 1, 'getUint8'], 72: [Int8Array, 1, 'getInt8'],
-  65: [null, 2, 'getUint16', false], 69: [null, 2, 'getUint16', true],
-  66: [null, 4, 'getUint32', false], 70: [null, 4, 'getUint32', true],
-  67: [null, 8, 'getBigUint64', false], 71: [null, 8, 'getBigUint64', true],
-  73: [null, 2, 'getInt16', false], 77: [null, 2, 'getInt16', true],
-  74: [null, 4, 'getInt32', false], 78: [null, 4, 'getInt32', true],
-  75: [null, 8, 'getBigInt64', false], 79: [null, 8, 'getBigInt64', true],
-  81: [null, 4, 'getFloat32', false], 85: [null, 4, 'getFloat32', true],
-  82: [null, 8, 'getFloat64', false], 86: [null, 8, 'getFloat64', true],
+  64: [1, 'getUint8'], 68: [1, 'getUint8'], 72: [1, 'getInt8'],
+  65: [2, 'getUint16', false], 69: [2, 'getUint16', true],
+  66: [4, 'getUint32', false], 70: [4, 'getUint32', true],
+  67: [8, 'getBigUint64', false], 71: [8, 'getBigUint64', true],
+  73: [2, 'getInt16', false], 77: [2, 'getInt16', true],
+  74: [4, 'getInt32', false], 78: [4, 'getInt32', true],
+  75: [8, 'getBigInt64', false], 79: [8, 'getBigInt64', true],
+  81: [4, 'getFloat32', false], 85: [4, 'getFloat32', true],
+  82: [8, 'getFloat64', false], 86: [8, 'getFloat64', true],
 }
 
-function typedArray([, width, read, little]) {
+function typedArray([width, read, little], limit) {
   return (inner) => {
     const bytes = inner()
     if (!(bytes instanceof Uint8Array)) throw new Error('a typed array is not a byte string')
     const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength)
-    const count = Math.min(Math.floor(bytes.length / width), LEAVES + 1)
+    const count = Math.min(Math.floor(bytes.length / width), limit)
     return Array.from({ length: count }, (_, index) => view[read](index * width, little))
   }
 }
 
-const TAGS = Object.fromEntries(Object.entries(ARRAYS).map(([tag, kind]) => [tag, typedArray(kind)]))
+/** How CBOR's typed arrays (RFC 8746) are read, each with so many values at most. */
+export function arrayTags(limit) {
+  return Object.fromEntries(Object.entries(ARRAYS).map(([tag, kind]) => [tag, typedArray(kind, limit)]))
+}
+
+const TAGS = arrayTags(LEAVES + 1)
 
 function leavesOfCbor(bytes) {
   const whole = cbor(bytes, { useMaps: true, tags: TAGS })
@@ -229,13 +239,14 @@ function number(value) {
   return Number.isFinite(found) ? found : null
 }
 
-async function inflate(payload) {
+/** What is in a compressed payload. Raises an Error when it is more than `limit` bytes. */
+export async function inflate(payload, limit = INFLATED) {
   const Decompress = await loadZstd()
   const parts = []
   let length = 0
   const stream = new Decompress((part) => {
     length += part.length
-    if (length > INFLATED) throw new Error(`it is more than ${size(INFLATED)}`)
+    if (length > limit) throw new Error(`it is more than ${size(limit)}`)
     parts.push(part)
   })
   for (let at = 0; at < payload.length; at += 16384) {
@@ -248,14 +259,6 @@ async function inflate(payload) {
     at += part.length
   }
   return whole
-}
-
-function isJpeg(bytes) {
-  return bytes[0] === 0xff && bytes[1] === 0xd8 && bytes[2] === 0xff
-}
-
-function isPng(bytes) {
-  return bytes[0] === 0x89 && bytes[1] === 0x50 && bytes[2] === 0x4e && bytes[3] === 0x47
 }
 
 /** Whether it is text to read: no control characters but white space, no replacement character. */

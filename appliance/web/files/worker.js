@@ -95,6 +95,7 @@ function end(reason) {
 }
 
 function signOut() {
+  unwatch()
   for (const each of [focus, drive]) each?.stop()
   desk?.stop()
   survey?.end(true)
@@ -105,6 +106,28 @@ function signOut() {
   kept = untold = 0
   state = { name: 'out', reason: '' }
 }
+
+// --- what a page watches: pictures or a map, over a connection that ends with the page -----------
+
+const VIEWERS = { camera: () => import('./camera-link.js'), map: () => import('./map-link.js') }
+
+let viewer = null
+let watching = 0
+
+async function watch({ kind, ...what }) {
+  unwatch()
+  const asked = watching
+  const { default: Viewer } = await VIEWERS[kind]()
+  if (asked === watching && login !== null) viewer = new Viewer(open, what)
+}
+
+function unwatch() {
+  watching += 1
+  viewer?.stop()
+  viewer = null
+}
+
+// -------------------------------------------------------------------------------------------------
 
 function take(topic, buffer, packet) {
   let entry = topics.get(topic)
@@ -201,6 +224,9 @@ const calls = {
   go: ({ linear, angular }) => drive?.go(linear, angular),
   stop: () => drive?.release(),
   leave: () => drive?.leave(),
+  watch,
+  unwatch,
+  next: () => viewer?.next(),
   request: async (values) => (await calling()).request(values),
   publish: async (values) => (await calling()).publish(values),
 }
@@ -213,6 +239,6 @@ self.onmessage = async ({ data: { number, call, values } }) => {
     self.postMessage({ number, error: String(error?.message ?? error) })
     return
   }
-  const pictures = answer?.focus?.bitmap ? [answer.focus.bitmap] : []
+  const pictures = [answer?.bitmap, answer?.focus?.bitmap].filter(Boolean)
   self.postMessage({ number, answer: answer ?? null }, pictures)
 }

@@ -1,0 +1,54 @@
+// What a page watches while it is open and can be seen: nothing comes for a page that is hidden.
+
+import { useEffect } from './vendor/hooks.mjs'
+import { ask, tell } from './link.js'
+
+/**
+ * Watch what `values` say, null for nothing; `take` gets one answer after the other.
+ * A bitmap in an answer is the taker's.
+ */
+export function useWatch(values, take) {
+  useEffect(() => {
+    if (values === null) return undefined
+    let run = 0
+    const begin = async () => {
+      const mine = ++run
+      await ask('watch', values)
+      for (;;) {
+        const answer = mine === run ? await ask('next') : null
+        if (mine !== run || answer === null) {
+          answer?.bitmap?.close()
+          return
+        }
+        take(answer)
+        await new Promise(requestAnimationFrame) // more than can be drawn is not asked for
+      }
+    }
+    const end = () => {
+      run += 1
+      tell('unwatch')
+    }
+    const change = () => {
+      end()
+      if (!document.hidden) begin().catch(() => {})
+    }
+    document.addEventListener('visibilitychange', change)
+    if (!document.hidden) begin().catch(() => {})
+    return () => {
+      document.removeEventListener('visibilitychange', change)
+      end()
+    }
+  }, [JSON.stringify(values)])
+}
+
+/** The routes to MQTT of certain types or encodings, of all robots, by their topics. */
+export function routesOf(robots, isWanted) {
+  const found = []
+  for (const { routes } of robots.values()) {
+    for (const route of routes ?? []) {
+      if (route?.direction !== 'to_mqtt' || typeof route.mqtt !== 'string') continue
+      if (typeof route.type === 'string' && isWanted(route)) found.push(route)
+    }
+  }
+  return found.sort((one, other) => (one.mqtt < other.mqtt ? -1 : 1))
+}

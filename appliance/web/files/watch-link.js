@@ -1,0 +1,48 @@
+// The connection of a page that watches a few topics: each at a rate of its own, the newest kept.
+
+export const PACKET = 17 * 1024 * 1024 // a picture has at most 16 MiB
+
+export class Watch {
+  /** Each of `wanted` is [topic, messages a second]; `take` gets each message, `tell` what changed. */
+  constructor(open, wanted, take, tell) {
+    this.reason = ''
+    this.isOver = false
+    const client = open({}, PACKET)
+    this.client = client
+    const say = (reason) => {
+      if (this.isOver || reason === this.reason) return
+      this.reason = reason
+      tell()
+    }
+    client.on('connect', () => {
+      say('')
+      for (const [topic, rate] of wanted) {
+        const properties = { userProperties: { 'max-rate': String(rate) } }
+        client.subscribe(topic, { qos: 0, properties }, (error, granted, packet) => {
+          const code = packet?.granted?.[0] ?? (error ? 0x80 : 0)
+          if (code >= 0x80) say(refusal(topic, code))
+        })
+      }
+    })
+    client.on('message', (topic, buffer, packet) => {
+      // A copy: the buffer is a view of all that has come with it.
+      if (!this.isOver) take(topic, new Uint8Array(buffer), packet.properties ?? {}, Date.now())
+    })
+    client.on('error', (error) => {
+      if (typeof error.code !== 'number' || error.code < 0x80) return
+      say(`The login was refused: ${error.message}`)
+      client.end(true) // asking again and again would only count as wrong passwords
+    })
+    client.on('close', () => { if (!this.reason) say('The connection is lost; trying again.') })
+  }
+
+  stop() {
+    this.isOver = true
+    this.client.end(true)
+  }
+}
+
+function refusal(topic, code) {
+  if (code !== 0x87) return `The subscription was refused (0x${code.toString(16)}).`
+  return `This user may not read this topic. The access rules would need the line: topic read ${topic}`
+}
