@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable
 from typing import Any
 
+import cbor2
 import pytest
 from appliance_process import ROBOT, ApplianceProcess
-from visits import PHONE, Visit
+from interop.paho_peer import V5, Peer
+from visits import DESKTOP, PHONE, Visit
 from waiting import eventually
 
 from appliance import config
@@ -88,3 +91,95 @@ def test_a_camera(visit: Callable[..., Visit], appliance: ApplianceProcess) -> N
     eventually(lambda: rates(appliance, CAMERA) == [2], "it is there again")
     page.click("nav a:has-text('Overview')")
     eventually(lambda: rates(appliance, CAMERA) == [], "the page is left")
+
+
+#: What may come in place of a picture, and what the page says then.
+NO_PICTURES = [
+    ("image/jpeg", b"", "empty"),
+    ("image/jpeg", b"\xff\xd8\xff\x00 no picture", "without a size"),
+    ("image/png", PIXEL[:45], "cannot be read"),
+    ("image/png", PIXEL[:16] + bytes([0, 0, 255, 255] * 2) + PIXEL[24:], "are shown"),
+    ("image/svg+xml", b"<svg xmlns='http://www.w3.org/2000/svg' onload='alert(1)'/>", "no picture"),
+    ("application/json", b'{"data": "<img src=x onerror=alert(2)>"}', "base64"),
+    ("application/json", b"[" * 100000, "JSON"),
+    ("application/cbor", bytes([0x81]) * 100000, "could not be shown"),
+    ("application/cdr", bytes([0, 1, 0, 0]) + b"\xff" * 20, "CompressedImage"),
+    ("text/html", b"<script>alert(3)</script>", "no picture"),
+]
+
+
+def test_pictures_that_are_none(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
+    """Each says what is wrong with it, and the next picture is shown."""
+    topic = f"{ROBOT}/hostile/<b>camera"
+    page = visit(**DESKTOP).sign_in(page="Camera")
+    page.evaluate("topic => location.hash = '#/camera/' + encodeURIComponent(topic)", topic)
+    eventually(lambda: rates(appliance, topic) == [5], "the page subscribes")
+    with Peer(appliance, V5) as peer:
+        for content_type, payload, words in NO_PICTURES:
+            peer.publish(topic, payload, ContentType=content_type)
+            page.wait_for_selector(f".notice.bad:has-text('{words}')")
+            peer.publish(topic, PIXEL, ContentType="image/png")
+            page.wait_for_selector(".notice.bad", state="detached")
+        page.wait_for_selector("dd:text-is('1 × 1')")
+
+
+def test_a_camera_that_may_not_be_read(
+    visit: Callable[..., Visit], appliance: ApplianceProcess
+) -> None:
+    page = visit(**PHONE).sign_in("viewer", "Camera")
+    page.evaluate("location.hash = '#/camera/other%2Fcamera'")
+    page.wait_for_selector(".notice.bad:has-text('topic read other/camera')")
+
+
+@pytest.mark.parametrize(("kind", "options"), [("phone", PHONE), ("desktop", DESKTOP)])
+def test_a_map(
+    visit: Callable[..., Visit], appliance: ApplianceProcess, kind: str, options: dict[str, Any]
+) -> None:
+    """The robot on its map, with what its scanner sees; not sent to a hidden tab."""
+    visited = visit(**options)
+    page = visited.sign_in(page="Map")
+    page.wait_for_selector("dd:text-is('240 × 240, 0.05 m')")
+    page.wait_for_selector("dd:text-is('360 points')")
+    page.wait_for_selector("dd:text-is('0.00, 0.00 m')")
+    assert page.locator(".notice").count() == 0
+    visited.look(f"{kind}-map")
+    first = pixels(page)
+    page.click("button[aria-label=Enlarge]")
+    eventually(lambda: pixels(page) != first, "it is larger")
+    page.focus("canvas")
+    for key in ("0", "ArrowLeft", "+", "-", "ArrowDown"):
+        page.keyboard.press(key)
+    page.mouse.wheel(0, -300)
+    visited.look(f"{kind}-map-moved")
+    show_as(page, hidden=True)
+    eventually(lambda: rates(appliance, f"{ROBOT}/odom") == [], "the subscriptions end")
+    show_as(page, hidden=False)
+    eventually(lambda: rates(appliance, f"{ROBOT}/odom") == [10], "and are there again")
+
+
+def test_maps_that_are_none(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
+    """Each says what is wrong with it; the last good one stays."""
+    page = visit(**DESKTOP).sign_in(page="Map")
+    page.wait_for_selector("dd:text-is('240 × 240, 0.05 m')")
+    info = {"resolution": 0.1, "width": 2, "height": 2, "origin": {"position": {"x": 0, "y": 0}}}
+    grids = [
+        ({"info": info, "data": [0]}, "2 × 2 cells, and 1"),
+        ({"info": {**info, "resolution": -1}, "data": [0] * 4}, "resolution of -1"),
+        ({"info": {**info, "resolution": None}, "data": [0] * 4}, "resolution of NaN"),
+        ({"info": {**info, "width": 1e9, "height": 1e9}, "data": [0] * 4}, "at most"),
+        ({"info": {**info, "origin": None}, "data": [0] * 4}, "a position of"),
+        ([[]], "no cells"),
+    ]
+    with Peer(appliance, V5) as peer:
+        for grid, words in grids:
+            content = {"ContentType": "application/json"}
+            peer.publish(f"{ROBOT}/map", json.dumps(grid), **content)
+            page.wait_for_selector(f".notice.bad:has-text('{words}')")
+        page.wait_for_selector("dd:text-is('240 × 240, 0.05 m')")
+        for part in ("odom", "scan"):  # the robot's next one is drawn again
+            peer.publish(f"{ROBOT}/{part}", "{}", **content)
+        side = 4000
+        head = {"info": {**info, "width": side, "height": side, "resolution": 0.05}}
+        large = cbor2.dumps({**head, "data": cbor2.CBORTag(72, bytes(side * side))})
+        peer.publish(f"{ROBOT}/map", large, ContentType="application/cbor")
+        page.wait_for_selector(f"dd:text-is('{side} × {side}, 0.05 m')")

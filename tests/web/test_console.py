@@ -151,11 +151,13 @@ def test_the_libraries_are_those_of_npm():
             assert (VENDOR / here).read_bytes() == original.read_bytes(), here
 
 
-def test_hostile_payloads():
-    """`formats.js` in node: exact, bounded, and no key of a payload becomes one of an object."""
+@pytest.mark.parametrize("name", ["formats", "camera", "map"])
+def test_hostile_payloads(name: str):
+    """What reads payloads, in node: exact, bounded, and no key becomes one of an object."""
     install()
+    tested = FILES / "formats.js" if name == "formats" else FILES
     done = subprocess.run(
-        ["node", str(Path(__file__).parent / "formats.js"), (FILES / "formats.js").as_uri()],
+        ["node", str(Path(__file__).parent / f"{name}.js"), tested.as_uri()],
         capture_output=True,
         text=True,
         timeout=PATIENCE,

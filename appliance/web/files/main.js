@@ -8,8 +8,9 @@ import { names, robots, rows, session, signIn, signOut, user } from './link.js'
 
 const html = htm.bind(h)
 
-const PAGES = [['overview', 'Overview'], ['topics', 'Topics'], ['drive', 'Drive'], ['camera', 'Camera']]
-const LOADERS = { topics: () => import('./topics.js'), drive: () => import('./drive.js'), camera: () => import('./camera.js') }
+const PAGES = [['overview', 'Overview'], ['topics', 'Topics'], ['drive', 'Drive'], ['camera', 'Camera'], ['map', 'Map']]
+const LOADERS = { topics: () => import('./topics.js'), drive: () => import('./drive.js'), camera: () => import('./camera.js'),
+  map: () => import('./map.js') }
 
 const place = signal(where())
 
