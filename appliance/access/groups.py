@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from appliance.access.acl import Acl
 from appliance.access.passwords import check_username
 from appliance.access.problems import AccessFileError, FileProblem, read_text
+from appliance.access.rewriting import locked, replacing
 
 #: The folder of the groups' files, beside the ACL file.
 FOLDER: Final = "groups"
@@ -57,14 +58,30 @@ def join(acl: Path, robot: str, user: str, wanted: Iterable[str]) -> None:
     """
     check_username(user)
     path = acl.resolve()  # of a symbolic link the file is replaced, not the link
-    wanted = list(dict.fromkeys(wanted))
+    wanted, known = list(dict.fromkeys(wanted)), groups(path)
     for name in wanted:
-        if name not in groups(path):
-            raise ValueError(f"there is no group {name!r}; there are {', '.join(groups(path))}")
+        if name not in known:
+            raise ValueError(f"there is no group {name!r}; there are {', '.join(known)}")
+    try:
+        with locked(path.parent):
+            status = path.stat()
+            text = _with_groups(read_text(path, _ADVICE), user, wanted)
+            with replacing(path, text) as draft:
+                with suppress(PermissionError):
+                    os.chown(draft, status.st_uid, status.st_gid)
+                draft.chmod(stat.S_IMODE(status.st_mode))
+                Acl.load(draft, robot)
+    except OSError as error:
+        text = f"cannot be written ({error.strerror}); use the user that owns the file"
+        raise AccessFileError([FileProblem(path, 0, 0, text)]) from error
+
+
+def _with_groups(text: str, user: str, wanted: list[str]) -> str:
+    """The rules with these groups for the user, at its first `user` line or at the end."""
     lines = [f"include {FOLDER}/{name}.conf" for name in wanted]
     kept: list[str] = []
     current: str | None = None
-    for line in read_text(path, _ADVICE).rstrip("\n").split("\n"):
+    for line in text.rstrip("\n").split("\n"):
         if named := _USER.fullmatch(line):
             current = named[1]
         elif current == user and _INCLUDE.fullmatch(line):
@@ -75,24 +92,4 @@ def join(acl: Path, robot: str, user: str, wanted: Iterable[str]) -> None:
             lines = []
     if lines:
         kept += ["", f"user {user}", *lines]
-    try:
-        _replace(path, "\n".join(kept) + "\n", robot)
-    except OSError as error:
-        text = f"cannot be written ({error.strerror}); use the user that owns the file"
-        raise AccessFileError([FileProblem(path, 0, 0, text)]) from error
-
-
-def _replace(path: Path, text: str, robot: str) -> None:
-    status = path.stat()
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    draft = Path(name)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-            os.fchmod(file.fileno(), stat.S_IMODE(status.st_mode))
-        Acl.load(draft, robot)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    return "\n".join(kept) + "\n"

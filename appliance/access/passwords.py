@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import base64
 import binascii
-import fcntl
 import hashlib
 import hmac
 import logging
 import os
 import re
 import stat
-import tempfile
 import threading
 import unicodedata
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +22,7 @@ from argon2.exceptions import InvalidHashError, VerificationError
 
 from appliance.access import scram
 from appliance.access.problems import AccessFileError, FileProblem, read_text
+from appliance.access.rewriting import locked, replacing
 
 _log = logging.getLogger(__name__)
 
@@ -346,7 +345,7 @@ def _rewrite(path: Path, changes: Mapping[str, str | None], only_if: str | None 
     With `only_if`, a user is replaced only if its hash still is that one.
     """
     path = path.resolve()  # Of a symbolic link the file is replaced, not the link.
-    with _locked(path.parent):
+    with locked(path.parent):
         try:
             status = path.stat()
         except FileNotFoundError:
@@ -368,38 +367,9 @@ def _rewrite(path: Path, changes: Mapping[str, str | None], only_if: str | None 
         if lines[-1] == "":
             lines.pop()
         lines += [f"{user}:{stored}" for user, stored in left.items() if stored is not None]
-        _replace(path, "".join(f"{line}\n" for line in lines), status)
-
-
-@contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Lock out other processes that rewrite a file of this directory.
-
-    The lock is on the directory because the file itself is replaced.
-    """
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-        os.fsync(descriptor)  # Makes the new name durable.
-    finally:
-        os.close(descriptor)
-
-
-def _replace(path: Path, text: str, status: os.stat_result | None) -> None:
-    """Write a temporary file and rename it to `path` once it is synced to disk."""
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
+        with replacing(path, "".join(f"{line}\n" for line in lines)) as draft:
             if status is not None:
                 # root may have changed a password: the appliance's user must still read the file.
                 with suppress(PermissionError):
-                    os.fchown(descriptor, status.st_uid, status.st_gid)
-                    os.fchmod(descriptor, 0o600 | stat.S_IMODE(status.st_mode) & 0o040)
-            os.fsync(descriptor)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+                    os.chown(draft, status.st_uid, status.st_gid)
+                    draft.chmod(0o600 | stat.S_IMODE(status.st_mode) & 0o040)

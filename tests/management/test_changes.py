@@ -13,8 +13,6 @@ from cryptography.x509.oid import NameOID
 from waiting import until
 
 from appliance import certs
-from appliance.access import Acl
-from appliance.access.groups import groups, join, members
 from appliance.mqtt.packets import Disconnect
 from appliance.mqtt.reason import ReasonCode
 from management.managed import BOTH, PASSWORD, CallError, Site
@@ -64,32 +62,6 @@ async def test_users(site: Site, version: int):
     assert '"user added"' in text and '"user removed"' in text
     assert PASSWORD not in text and "another" not in text
     assert "c" not in {each["user"] for each in (await admin.call("users"))["users"]}
-
-
-def test_groups_of_a_file(tmp_path: Path):
-    (tmp_path / "groups").mkdir()
-    for name in ("a", "b"):
-        (tmp_path / f"groups/{name}.conf").write_text(f"topic read {name}/#\n")
-    acl = tmp_path / "acl.conf"
-    text = "# who\nuser x\ninclude groups/a.conf\ntopic read own\n\nuser y\ninclude groups/a.conf\n"
-    acl.write_text(text)
-    acl.chmod(0o640)
-    assert groups(acl) == ["a", "b"] and members(acl) == {"x": ["a"], "y": ["a"]}
-    join(acl, "r2", "x", ["b", "a", "b"])
-    assert acl.read_text() == text.replace(
-        "user x\ninclude groups/a.conf\n", "user x\ninclude groups/b.conf\ninclude groups/a.conf\n"
-    )
-    join(acl, "r2", "x", [])
-    join(acl, "r2", "new one", ["b"])
-    assert members(acl) == {"y": ["a"], "new one": ["b"]}
-    assert "topic read own" in acl.read_text() and acl.stat().st_mode & 0o777 == 0o640
-    assert {rule.user for rule in Acl.load(acl, "r2").rules} == {"x", "y", "new one"}
-    before = acl.read_text()
-    with pytest.raises(ValueError, match="no group 'c'; there are a, b"):
-        join(acl, "r2", "x", ["c"])
-    with pytest.raises(ValueError):
-        join(acl, "r2", "x\ntopic write #", ["a"])
-    assert acl.read_text() == before and not list(tmp_path.glob(".acl*"))
 
 
 async def test_certificates(tmp_path: Path):
