@@ -178,8 +178,17 @@ def test_maps_that_are_none(visit: Callable[..., Visit], appliance: AppliancePro
         page.wait_for_selector("dd:text-is('240 × 240, 0.05 m')")
         for part in ("odom", "scan"):  # the robot's next one is drawn again
             peer.publish(f"{ROBOT}/{part}", "{}", **content)
-        side = 4000
-        head = {"info": {**info, "width": side, "height": side, "resolution": 0.05}}
-        large = cbor2.dumps({**head, "data": cbor2.CBORTag(72, bytes(side * side))})
-        peer.publish(f"{ROBOT}/map", large, ContentType="application/cbor")
+
+
+def test_a_large_map(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
+    """One of 4000 × 4000 cells, which is retained."""
+    side = 4000
+    info = {"resolution": 0.05, "width": side, "height": side}
+    info["origin"] = {"position": {"x": 0, "y": 0}}
+    large = cbor2.dumps({"info": info, "data": cbor2.CBORTag(72, bytes(side * side))})
+    with Peer(appliance, V5) as peer:
+        peer.publish(f"{ROBOT}/map", large, retain=True, ContentType="application/cbor")
+        page = visit(**DESKTOP).sign_in(page="Map")
         page.wait_for_selector(f"dd:text-is('{side} × {side}, 0.05 m')")
+        page.click("button[aria-label=Enlarge]")
+        peer.publish(f"{ROBOT}/map", b"", retain=True)
