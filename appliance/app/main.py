@@ -358,6 +358,7 @@ class App:
         self._verbs = management.verbs(
             management.ManagementParts(
                 self.broker,
+                self._entries,
                 self._access,
                 self.bridge,
                 self.upstreams,
@@ -367,6 +368,7 @@ class App:
                 self.audit,
             )
         )
+        self._stack.push_async_callback(self._verbs.stop)
         calls = ManagementCalls(self.broker, self._entries, self._verbs)
         calls.start()
         self._stack.push_async_callback(calls.stop)

@@ -18,6 +18,7 @@ from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
 from appliance.management.users import UserVerbs
 from appliance.management.verbs import Arguments, Caller, Verb, Verbs
+from appliance.net.callbacks import Entries
 from appliance.ops.audit import Audit
 from appliance.ros.bridge import Bridge
 from appliance.ros.calls.dispatcher import CallError
@@ -36,6 +37,7 @@ class ManagementParts:
     """The parts that the verbs are about. `reload` applies the files as they are now."""
 
     broker: Broker
+    entries: Entries
     access: FileAccess
     bridge: Bridge | None
     upstreams: Sequence[Uplink]
@@ -66,7 +68,7 @@ def verbs(parts: ManagementParts) -> Verbs:
     ]
     if reload.settings.file is not None:
         found += DoctorVerb(reload.settings.file).verbs()
-    return Verbs(found, parts.audit.changed if parts.audit is not None else None)
+    return Verbs(found, parts.entries, parts.audit.changed if parts.audit is not None else None)
 
 
 class ApplianceVerbs:

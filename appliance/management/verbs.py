@@ -2,7 +2,8 @@
 
 A verb is implemented once. `mqtt_calls.py` makes it an MQTT call, and `Verbs.command` a command of
 the control socket. Arguments are a stranger's: pydantic checks them strictly, and every string and
-list has a limit. A change is in the audit log with its caller, also one that failed.
+list has a limit. A change is in the audit log with its caller, also one that failed. It is finished
+also when the time of its call is over: files and what is in force must not differ.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from appliance.broker.values import Identity
 from appliance.mqtt.codec import quote
+from appliance.net.callbacks import Entries
 from appliance.ops.control import Command, ControlError
 from appliance.ros.calls.dispatcher import CallError
 
@@ -100,10 +102,13 @@ Note = Callable[..., None]
 class Verbs:
     """All verbs by name, and how one is run."""
 
-    def __init__(self, verbs: Iterable[Verb[Any]], note: Note | None) -> None:
+    def __init__(self, verbs: Iterable[Verb[Any]], entries: Entries, note: Note | None) -> None:
         """`note` writes to the audit log; None where there is none."""
         self.by_name: dict[str, Verb[Any]] = {verb.name: verb for verb in verbs}
+        self._entries = entries
         self._note = note
+        #: The changes under way.
+        self._changes: set[asyncio.Task[object]] = set()
         #: What checks the arguments of the verbs that were called.
         self._adapters: dict[str, TypeAdapter[Any]] = {}
 
@@ -117,14 +122,36 @@ class Verbs:
         arguments = _checked(adapter, given)
         if not verb.changes:
             return await verb.run(caller, arguments)
+        change = self._entries.task("management.change", self._change(caller, verb, arguments))
+        self._changes.add(change)
+        self._entries.when_done("management.changed", change, self._changes.discard, change)
+        outcome = await asyncio.shield(change)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    async def _change(self, caller: Caller, verb: Verb[Any], arguments: Any) -> object:
+        """Change something and note it; returns the result, or the exception in its place."""
         details = verb.changed(arguments)
         try:
             result = await verb.run(caller, arguments)
         except CallError as error:
             self._changed(caller, f"nothing: {verb.changes}", error=str(error), **details)
-            raise
+            return error
+        except BaseException as error:  # a fault, or the appliance stops
+            self._changed(caller, f"perhaps: {verb.changes}", error=repr(error), **details)
+            if not isinstance(error, Exception):
+                raise
+            return error
         self._changed(caller, verb.changes, **details)
         return result
+
+    async def stop(self) -> None:
+        """Cut off the changes under way; may be called twice."""
+        changes = list(self._changes)
+        for change in changes:
+            change.cancel()
+        await asyncio.gather(*changes, return_exceptions=True)
 
     def _changed(self, caller: Caller, what: str, **details: Any) -> None:
         told = ", ".join(f"{key} {quote(str(value))}" for key, value in details.items())
