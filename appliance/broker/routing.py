@@ -256,6 +256,20 @@ class Router:
             return f"more than {limits.topic_length} bytes (broker.limits.topic_length)"
         return ""
 
+    def is_watched(self, topic: str) -> bool:
+        """Whether a connected client that may read the topic has asked for it by its last level.
+
+        Who has subscribed to `#` has not asked for it, but receives it as well.
+        """
+        ending = topic.rpartition("/")[2]
+        for match in self._subscriptions.match(topic):
+            members = match.members if isinstance(match, Share) else dict((match,))
+            for session, subscription in members.items():
+                is_named = subscription.filter.rpartition("/")[2] == ending
+                if is_named and session.link is not None and self.may_receive(session, topic):
+                    return True
+        return False
+
     def _targets(
         self, origin: Session, topic: str, matches: list[tuple[Session, Subscription] | Share]
     ) -> tuple[list[Target], list[tuple[Share, list[Target]]], list[RatedTarget]]:

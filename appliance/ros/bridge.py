@@ -32,6 +32,7 @@ from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics, DiagnosticsTopic
 from appliance.ros.graph_follower import FlowKey, GraphFollower, TopicRoutes
+from appliance.ros.live import LiveFigures
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
@@ -112,7 +113,8 @@ class Bridge:
         diagnostics: float = 0.0,
     ) -> None:
         """The bridge publishes what is bridged on `{robot}/_appliance/routes`, what is not on
-        `…/skipped`, and every `diagnostics` seconds its status on `/diagnostics`; never for 0.
+        `…/skipped`, while somebody looks figures on `…/live`, and every `diagnostics` seconds its
+        status on `/diagnostics`; never for 0.
         """
         self.problem: str | None = None
         self.peers: int | None = None
@@ -132,6 +134,7 @@ class Bridge:
         self._schemas = SchemaTopics(broker, entries, robot, node.describe)
         self._session: Session | None = None
         self._cleanup = RetainedCleanup(broker, entries)
+        self._live = LiveFigures(broker, entries, robot)
         self._mailbox = Mailbox(self._wake)
         self._converters = Converters(node.describe, node.now)
         self._conversions = ConversionQueue(entries, broker.accounting)
@@ -505,8 +508,11 @@ class Bridge:
 
     def _meter(self) -> None:
         now = self._loop.time()
-        for flow in self._flows():
+        flows = self._flows()
+        for flow in flows:
             flow.meter.tick(now, flow.counters.messages, flow.counters.bytes)
+        if self._session is not None:
+            self._live.publish(flows, self._session)
         self._metered += 1
         if self._metered % METERS_TO_ANNOUNCE == 0:
             self._announce()

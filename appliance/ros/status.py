@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 from appliance.broker.histogram import Histogram
 from appliance.ros.metrics import FlowCounters
@@ -25,11 +26,13 @@ class CommandStatus:
     """What a route to ROS does to commands, for who drives; times in seconds.
 
     `clamp` has the bounds of fields by their path. `on_silence` is the time after which the stop
-    message follows, None without one. `lease` is how long a silent client holds the topic, None if
-    it is not exclusive, and `commanding` is who holds it.
+    message follows, None without one. A command that is older than `expire` is not published, None
+    for any age. `lease` is how long a silent client holds the topic, None if it is not exclusive,
+    and `commanding` is who holds it.
     """
 
     clamp: dict[str, tuple[float, float]]
+    expire: float | None
     on_silence: float | None
     exclusive: bool
     lease: float | None
@@ -42,8 +45,9 @@ class TopicStatus:
 
     `rate` is in messages per second, `size` the mean payload in bytes, `latency_ms` from the
     publisher on ROS to the broker, None if none was measured. `last_error` is the problem with the
-    last message that was not carried. The counters are `FlowCounters` since the topic came. `rules`
-    are those of a topic to ROS, None if its route has none.
+    last message that was not carried. The counters are `FlowCounters` since the topic came.
+    `max_rate` (messages per second), `qos` and `retain` are the route's, None where it has none.
+    `rules` are those of a topic to ROS, None if its route has none.
     """
 
     ros: str
@@ -63,6 +67,9 @@ class TopicStatus:
     refused: int
     last_error: str | None
     latency_ms: LatencyStatus | None
+    max_rate: float | None
+    qos: int | None
+    retain: bool | None
     rules: CommandStatus | None
 
 
@@ -126,6 +133,9 @@ def topic_status(bridged: BridgedTopic, flow: Flow) -> TopicStatus:
         counters.refused,
         counters.last_error,
         latency_status(counters.latency),
+        flow.settings.rate,
+        flow.settings.qos,
+        flow.settings.retain,
         _command_status(bridged, flow),
     )
 
@@ -136,6 +146,7 @@ def _command_status(bridged: BridgedTopic, flow: Flow) -> CommandStatus | None:
         return None
     return CommandStatus(
         {path: (low, high) for path, low, high in rules.clamp},
+        None if rules.oldest == inf else rules.oldest,
         None if rules.on_silence is None else rules.on_silence.after,
         rules.exclusive,
         rules.lease if rules.exclusive else None,
