@@ -29,20 +29,23 @@ MOST_OF_ONE: Final = 1000
 #: The bytes of an entry beside its names, about.
 _ENTRY_SIZE: Final = 400
 
-#: Sessions that are looked through for one unit of cost.
+#: Sessions that are looked through for one unit of cost, without and with a text that is searched.
 _LOOKED_PER_COST_UNIT: Final = 16
+_SEARCHED_PER_COST_UNIT: Final = 4
 
 
 @dataclass(eq=False)
 class ListClients(Arguments):
     """Which clients: all, of one user, one by its id; connected ones or absent ones alone.
 
-    `after` is the last one of the page before.
+    `search` is a part of the id, the user or the address, in any case. `after` is the last one of
+    the page before.
     """
 
     client: Name | None = None
     user: Name | None = None
     connected: bool | None = None
+    search: Name | None = None
     after: Name | None = None
     limit: Annotated[int, Field(ge=1, le=MOST_CLIENTS)] = 100
 
@@ -76,7 +79,8 @@ class ClientVerbs:
 
     async def _list(self, caller: Caller, wanted: ListClients) -> dict[str, Any]:
         sessions = self._broker.sessions
-        self._broker.counters.cost += len(sessions) // _LOOKED_PER_COST_UNIT
+        looked = _LOOKED_PER_COST_UNIT if not wanted.search else _SEARCHED_PER_COST_UNIT
+        self._broker.counters.cost += len(sessions) // looked
         if wanted.client is not None:
             one = sessions.get(wanted.client)
             found = [one] if one is not None and _matches(one, wanted) else []
@@ -129,7 +133,16 @@ def _matches(session: Session, wanted: ListClients) -> bool:
     if wanted.connected is not None and wanted.connected is not (session.link is not None):
         return False
     username = session.identity.username if session.identity is not None else None
-    return wanted.user is None or username == wanted.user
+    if wanted.user is not None and username != wanted.user:
+        return False
+    return not wanted.search or wanted.search.lower() in _named_by(session, username).lower()
+
+
+def _named_by(session: Session, username: str | None) -> str:
+    """What a client is found by."""
+    link = session.link
+    address = link.transport.address if isinstance(link, Output) else ""
+    return f"{session.client_id}\n{username or ''}\n{address}"
 
 
 def _entry(session: Session, most: int, room: int) -> tuple[dict[str, Any], int]:

@@ -86,9 +86,10 @@ class RightsVerbs:
             "allowed": decision.allowed,
             "reason": decision.reason,
         }
-        if not decision.allowed and self._lacks_rule(identity, action, topic):
-            answer["line"] = f"topic {_ACCESS[action]} {_filter(topic)}"
-        return answer
+        acl = self._access.acl
+        if acl is None or decision.allowed:
+            return answer
+        return answer | self._line(acl.verdict(identity, action, topic), topic)
 
     def _decide(self, identity: Identity, action: Action, topic: str) -> Decision:
         router = self._broker.router
@@ -106,15 +107,14 @@ class RightsVerbs:
             return router.may_publish(identity, topic)
         return router.decide(identity, action, topic)
 
-    def _lacks_rule(self, identity: Identity, action: Action, topic: str) -> bool:
-        """Whether it is a rule that is missing: no other one helps against a rule that denies."""
-        if action is Action.PUBLISH and self._broker.router.reserved_for(topic):
-            return False
-        acl = self._access.acl
-        if acl is None:
-            return False
-        verdict = acl.verdict(identity, action, topic)
-        return not verdict.allowed and verdict.rule is None
+    def _line(self, verdict: ActionVerdict, topic: str) -> dict[str, str]:
+        """The `line` that would allow it where a rule is missing: none helps against one that
+        denies, or where nobody may publish."""
+        if verdict.allowed or verdict.rule is not None:
+            return {}
+        if verdict.action is Action.PUBLISH and self._broker.router.reserved_for(topic):
+            return {}
+        return {"line": f"topic {_ACCESS[verdict.action]} {_filter(topic)}"}
 
     async def _explain(self, caller: Caller, wanted: Explain) -> dict[str, Any]:
         acl, identity = self._access.acl, Identity(wanted.user, wanted.client)
@@ -125,7 +125,9 @@ class RightsVerbs:
             explanation = await asyncio.to_thread(acl.explain, identity, wanted.topic)
         except ValueError as error:
             raise CallError("bad_request", f"{quote(wanted.topic[:200])}: {error}") from None
-        verdicts = [_verdict(each) for each in explanation.verdicts]
+        verdicts = [
+            _verdict(each) | self._line(each, wanted.topic) for each in explanation.verdicts
+        ]
         return {"user": wanted.user, "topic": wanted.topic, "verdicts": verdicts}
 
 

@@ -42,6 +42,9 @@ async def test_who_is_connected(site: Site, version: int):
     await until(lambda: site.app.broker.sessions["v"].link is None, "the viewer to leave")
     (away,) = (await admin.call("clients", {"connected": False}))["clients"]
     assert away["client"] == "v" and not away["connected"] and 0 < away["ends_in"] <= 60
+    for text, found in (("", ["a", "v"]), ("VIEW", ["v"]), ("127.0.0.1:", ["a"]), ("x", [])):
+        listed = (await admin.call("clients", {"search": text}))["clients"]
+        assert [each["client"] for each in listed] == found, text
     # The control socket has the same verbs.
     local = await asyncio.to_thread(
         ask, site.app.settings.control, "clients", 30.0, {"user": "viewer"}
@@ -131,6 +134,11 @@ async def test_what_may_i_do(site: Site, version: int):
     assert not own["allowed"] and "line" not in own
     assert kick["line"] == f"topic write {topic_of('disconnect')}"
     assert rights["allowed"] and not spy["allowed"]
+    admin = await site.join("a", version=version)
+    for topic, line in (("other", "topic write other"), ("r2d2/_appliance/state", None)):
+        verdicts = (await admin.call("explain", {"user": "viewer", "topic": topic}))["verdicts"]
+        (publish,) = (each for each in verdicts if each["action"] == "publish")
+        assert not publish["allowed"] and publish.get("line") == line
 
 
 @pytest.mark.parametrize("version", BOTH)

@@ -271,6 +271,13 @@ export function cut(text, length) {
   return text.length > length ? `${text.slice(0, length)}…` : text
 }
 
+/** A name or a line as it can be shown: short, and what is invisible or turns text round is not. */
+export function shown(name, length = 120) {
+  if (name === '') return '(empty)'
+  // eslint-disable-next-line no-control-regex
+  return cut(name, length).replace(/[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]/g, '·')
+}
+
 export function size(bytes) {
   if (bytes < 1024) return `${bytes} B`
   return bytes < 1048576 ? `${(bytes / 1024).toFixed(1)} KiB` : `${(bytes / 1048576).toFixed(1)} MiB`

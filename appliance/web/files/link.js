@@ -130,8 +130,8 @@ export function request(topic, payload, timeout) {
 }
 
 /** What a verb of the appliance's management answers (docs/management.md). */
-export async function verb(name, values = {}) {
-  return JSON.parse(await request(`$CONTROL/appliance/v1/${name}/_call`, JSON.stringify(values)))
+export async function verb(name, values = {}, timeout = undefined) {
+  return JSON.parse(await request(`$CONTROL/appliance/v1/${name}/_call`, JSON.stringify(values), timeout))
 }
 
 export function signIn(name, password) {

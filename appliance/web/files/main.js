@@ -8,9 +8,25 @@ import { names, robots, rows, session, signIn, signOut, user } from './link.js'
 
 const html = htm.bind(h)
 
-const PAGES = [['overview', 'Overview'], ['topics', 'Topics'], ['drive', 'Drive'], ['camera', 'Camera'], ['map', 'Map']]
-const LOADERS = { topics: () => import('./topics.js'), drive: () => import('./drive.js'), camera: () => import('./camera.js'),
-  map: () => import('./map.js') }
+const PAGES = [
+  ['overview', 'Overview'],
+  ['topics', 'Topics'],
+  ['drive', 'Drive'],
+  ['camera', 'Camera'],
+  ['map', 'Map'],
+  ['clients', 'Clients'],
+  ['access', 'Access'],
+  ['health', 'Health'],
+]
+const LOADERS = {
+  topics: () => import('./topics.js'),
+  drive: () => import('./drive.js'),
+  camera: () => import('./camera.js'),
+  map: () => import('./map.js'),
+  clients: () => import('./clients.js'),
+  access: () => import('./access.js'),
+  health: () => import('./health.js'),
+}
 
 const place = signal(where())
 
@@ -36,7 +52,10 @@ function Console() {
 function Frame() {
   const { name, reason } = session.value
   const { page, topic } = place.value
-  useEffect(() => { document.querySelector('main')?.focus() }, [page])
+  useEffect(() => {
+    document.querySelector('main')?.focus()
+    document.querySelector('header nav [aria-current]')?.scrollIntoView({ block: 'nearest', inline: 'nearest' })
+  }, [page])
   return html`
     <header>
       <strong class="robot">${robotName()}</strong>

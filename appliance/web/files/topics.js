@@ -4,7 +4,9 @@ import { h } from './vendor/preact.mjs'
 import { useEffect, useMemo, useRef, useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
+import { shown } from './formats.js'
 import { ask, focus, inspected, isPaused, names, pause, robots, rows, tell, untold } from './link.js'
+import { save } from './save.js'
 
 const html = htm.bind(h)
 
@@ -109,26 +111,12 @@ function rateOf(name, row) {
   return row.rate >= 1.8 ? '≥ 2 Hz' : `${row.rate.toFixed(1)} Hz`
 }
 
-/** A name as it can be shown: short, and control characters visible. */
-function shown(name) {
-  if (name === '') return '(empty)'
-  const text = name.length > 120 ? `${name.slice(0, 120)}…` : name
-  // eslint-disable-next-line no-control-regex
-  return text.replace(/[\x00-\x1f\x7f-\x9f]/g, '·')
-}
-
 // --- the inspector ---------------------------------------------------------------------------
 
 function Inspector({ topic }) {
   const told = inspected.value
   const message = told?.topic === topic ? told.message : null
-  const save = async () => {
-    const link = document.createElement('a')
-    link.href = URL.createObjectURL(await ask('export'))
-    link.download = `${topic.replace(/[^\w.-]+/g, '_').slice(0, 80)}.jsonl`
-    link.click()
-    setTimeout(() => URL.revokeObjectURL(link.href), 10000)
-  }
+  const keep = async () => save(await ask('export'), `${topic}.jsonl`)
   return html`<section class="inspector" aria-labelledby="inspected">
     <div class="tools"><h2 id="inspected"><bdi>${shown(topic)}</bdi></h2>
       <a class="button" href="#/topics">Close</a></div>
@@ -137,7 +125,7 @@ function Inspector({ topic }) {
       <div class="tools">
         <button aria-pressed=${isPaused.value} onClick=${() => pause(!isPaused.value)}>
           ${isPaused.value ? 'Continue' : 'Pause'}</button>
-        <button onClick=${save}>Export ${told.kept} messages</button>
+        <button onClick=${keep}>Export ${told.kept} messages</button>
       </div>
       <dl class="properties">
         <div><dt>received</dt><dd>${clock(message.at)}</dd></div>
