@@ -26,6 +26,10 @@ _MOST_PASSED: Final = 100
 #: The cost of a decision about a topic that was not asked about before.
 _COST: Final = 10
 
+#: Seconds after which the other questions of a call wait for the loop's next round: to decide about
+#: a wide filter takes a hundredth of a millisecond for each rule below it.
+_ROUND: Final = 0.005
+
 _ACTIONS: Final = {
     "publish": Action.PUBLISH,
     "subscribe": Action.SUBSCRIBE,
@@ -74,8 +78,16 @@ class RightsVerbs:
     async def _rights(self, caller: Caller, wanted: Questions) -> dict[str, Any]:
         assert caller.identity is not None
         identity = caller.identity
-        self._broker.counters.cost += _COST * len(wanted.questions)
-        return {"rights": [self._right(identity, each) for each in wanted.questions]}
+        clock = asyncio.get_running_loop().time
+        rights: list[dict[str, Any]] = []
+        began = clock()
+        for question in wanted.questions:
+            if clock() - began > _ROUND:
+                await asyncio.sleep(0)
+                began = clock()
+            self._broker.counters.cost += _COST
+            rights.append(self._right(identity, question))
+        return {"rights": rights}
 
     def _right(self, identity: Identity, question: Question) -> dict[str, Any]:
         action, topic = _ACTIONS[question.action], question.topic
