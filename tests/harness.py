@@ -170,12 +170,16 @@ def abort(transport: asyncio.WriteTransport) -> None:
 class Peer:
     """The client's side of a connection."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def __init__(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, version: int = 5
+    ) -> None:
         self.reader = reader
         self.writer = writer
+        self.version = version
 
     async def send(self, *packets: Packet | bytes) -> None:
-        self.writer.write(b"".join(p if isinstance(p, bytes) else p.encode(5) for p in packets))
+        data = (p if isinstance(p, bytes) else p.encode(self.version) for p in packets)
+        self.writer.write(b"".join(data))
         await asyncio.wait_for(self.writer.drain(), PATIENCE)
 
     async def receive(self) -> Packet:
@@ -187,7 +191,7 @@ class Peer:
         while header[-1] & 0x80:
             header += await self.reader.readexactly(1)
         length, _ = decode_varint(header, 1)
-        return decode_packet(header[0], await self.reader.readexactly(length), 5)
+        return decode_packet(header[0], await self.reader.readexactly(length), self.version)
 
     async def receive_rest(self) -> bytes:
         """All bytes until the connection ends."""

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from harness import abort, make_contexts
-from waiting import PATIENCE
+from harness import Peer, make_contexts
 
 from appliance import config
 from appliance.access import Passwords
 from appliance.app.main import App
 from appliance.management.topics import TOPICS, topic_of
-from appliance.mqtt.codec import V5, V311, Property, decode_varint
+from appliance.mqtt.codec import V5, V311, Property
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -27,7 +26,6 @@ from appliance.mqtt.packets import (
     Suback,
     Subscribe,
     Subscription,
-    decode_packet,
 )
 
 SETTINGS: dict[str, Any] = {
@@ -73,7 +71,7 @@ class Caller:
         self._numbers = iter(range(1, 60_000))
 
     async def connect(self, address: tuple[str, int], user: str, **options: Any) -> None:
-        self._reader, self._writer = await asyncio.open_connection(*address)
+        self._peer = Peer(*await asyncio.open_connection(*address), self.version)
         password = PASSWORD.encode()
         await self.send(
             Connect(self.name, version=self.version, username=user, password=password, **options)
@@ -82,20 +80,10 @@ class Caller:
         assert isinstance(connack, Connack) and not connack.reason_code, connack
 
     async def send(self, packet: Packet) -> None:
-        self._writer.write(packet.encode(self.version))
-        await asyncio.wait_for(self._writer.drain(), PATIENCE)
+        await self._peer.send(packet)
 
     async def receive(self) -> Packet:
-        """The next packet; IncompleteReadError or ConnectionError when there is none."""
-        return await asyncio.wait_for(self._hear(), PATIENCE)
-
-    async def _hear(self) -> Packet:
-        header = await self._reader.readexactly(2)
-        while header[-1] & 0x80:
-            header += await self._reader.readexactly(1)
-        length, _ = decode_varint(header, 1)
-        body = await self._reader.readexactly(length)
-        return decode_packet(header[0], body, self.version)
+        return await self._peer.receive()
 
     async def subscribe(self, topic_filter: str, qos: int = 0) -> int:
         await self.send(Subscribe(next(self._numbers), [Subscription(topic_filter, qos)]))
@@ -139,7 +127,7 @@ class Caller:
         return answer
 
     def hang_up(self) -> None:
-        abort(self._writer.transport)
+        self._peer.hang_up()
 
 
 class Site:

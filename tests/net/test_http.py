@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from both_loops import event_loop_policy as event_loop_policy
-from harness import Harness, make_contexts
+from harness import Harness
 from http_client import answer, ask
 from waiting import PATIENCE, until
 from websockets.asyncio.client import connect
@@ -87,11 +87,6 @@ class WebHarness(Harness):
 
     async def _broken(self, request: HttpRequest) -> HttpResponse:
         raise ZeroDivisionError("the test says so")
-
-
-@pytest.fixture(scope="module")
-def contexts(tmp_path_factory: pytest.TempPathFactory):
-    return make_contexts(tmp_path_factory.mktemp("certs") / "certs")
 
 
 @pytest.fixture

@@ -54,12 +54,6 @@ pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_polic
 MIB = 1 << 20
 
 
-@pytest.fixture(scope="module")
-def contexts(tmp_path_factory: pytest.TempPathFactory) -> tuple[ssl.SSLContext, ssl.SSLContext]:
-    """The server's and the client's settings for TLS."""
-    return make_contexts(tmp_path_factory.mktemp("certs") / "certs")
-
-
 @pytest.fixture
 async def harness(contexts) -> AsyncIterator[Harness]:
     harness = Harness(*contexts)

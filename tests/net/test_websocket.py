@@ -17,7 +17,7 @@ from typing import Any, cast
 import paho.mqtt.client as paho
 import pytest
 from both_loops import event_loop_policy as event_loop_policy
-from harness import Harness, Peer, PublishObserver, abort, make_contexts
+from harness import Harness, Peer, PublishObserver, abort
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from waiting import PATIENCE, until
 from websockets.asyncio.client import ClientConnection, connect
@@ -52,11 +52,6 @@ from appliance.net.websocket import FRAME_COST
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 MIB = 1 << 20
-
-
-@pytest.fixture(scope="module")
-def contexts(tmp_path_factory: pytest.TempPathFactory):
-    return make_contexts(tmp_path_factory.mktemp("certs") / "certs")
 
 
 @pytest.fixture

@@ -26,6 +26,13 @@ from upstream.uplink_rig import event_loop_policy as event_loop_policy
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
 
 
+def hurry_to_judge(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection has lived soon, so that what ends it is soon found."""
+    hurry(monkeypatch)
+    monkeypatch.setattr(uplink, "TICK", 0.05)
+    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+
+
 class Connections:
     """Connections to a broker that closes at some filters."""
 
@@ -110,9 +117,7 @@ def test_a_filter_is_left_out_for_longer_each_time() -> None:
 async def test_a_link_works_without_a_filter_and_asks_for_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    hurry(monkeypatch)
-    monkeypatch.setattr(uplink, "TICK", 0.05)
-    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    hurry_to_judge(monkeypatch)
     monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 1.0)
     command, secret = "fleet/r2d2/cmd/#", "fleet/r2d2/secret/#"
     rules = [{"topic": "secret/#"}, {"topic": "cmd/#"}]
@@ -152,9 +157,7 @@ def _disconnect(visit: Visit) -> None:
 async def test_a_link_works_without_a_state_that_the_fleet_does_not_take_and_says_it_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, how: str
 ) -> None:
-    hurry(monkeypatch)
-    monkeypatch.setattr(uplink, "TICK", 0.05)
-    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    hurry_to_judge(monkeypatch)
     monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 2.0)
     state, door = "fleet/r2d2/_appliance/state", "fleet/r2d2/events/door"
     async with FakeFleet() as fleet:
@@ -196,9 +199,7 @@ async def test_closes_behind_a_state_that_the_fleet_takes_leave_nothing_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As of a broker that restarts again and again."""
-    hurry(monkeypatch)
-    monkeypatch.setattr(uplink, "TICK", 0.05)
-    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    hurry_to_judge(monkeypatch)
     state = "fleet/r2d2/_appliance/state"
     async with FakeFleet() as fleet:
 
@@ -218,9 +219,7 @@ async def test_closes_behind_a_state_that_the_fleet_takes_leave_nothing_out(
 async def test_closes_between_connack_and_suback_leave_no_command_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hurry(monkeypatch)
-    monkeypatch.setattr(uplink, "TICK", 0.05)
-    monkeypatch.setattr(unanswered_module, "LIVED", 0.2)
+    hurry_to_judge(monkeypatch)
     async with FakeFleet() as fleet:
 
         def grant(visit: Visit, packet: Subscribe) -> None:
