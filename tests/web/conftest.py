@@ -35,6 +35,7 @@ topic write $CONTROL/appliance/v1/+/_call/#
 
 user viewer
 topic read {robot}/#
+topic write $CONTROL/appliance/v1/rights/_call
 """
 PASSWORD = "only-to-look-at-1"
 

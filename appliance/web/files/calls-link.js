@@ -44,7 +44,7 @@ export class Calls {
     const token = crypto.getRandomValues(new Uint32Array(2)).join('-')
     let timer = null
     const late = new Promise((resolve, reject) => {
-      timer = setTimeout(() => reject(new Error(`No answer within ${timeout / 1000} s.`)), timeout)
+      timer = setTimeout(() => reject(new Error(`No answer within ${timeout / 1000} s, or one of more than 2 MiB.`)), timeout)
     })
     try {
       return await Promise.race([late, this.carryOut(topic, payload, above, token)])

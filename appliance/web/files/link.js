@@ -12,6 +12,8 @@ export const untold = signal(0)
 export const robots = signal(new Map()) // robot → {routes, skipped}
 export const inspected = signal(null)
 export const drive = signal(null)
+/** What is kept for the open page: topics with {text, isJson, size, rate, at}, and filters that were refused. */
+export const shelf = signal({ topics: new Map(), refused: [] })
 export const isPaused = signal(false)
 
 let worker = null
@@ -81,6 +83,7 @@ function take(told) {
     if (!isPaused.peek()) takeRows(told.rows)
     else held.push(...told.rows.slice(0, 1000))
     if (held.length > 5000) held.splice(0, held.length - 5000)
+    if (told.shelf?.run === keeping) takeShelf(told.shelf)
     if (told.focus) {
       inspected.peek()?.bitmap?.close()
       inspected.value = told.focus
@@ -122,6 +125,26 @@ function forget() {
 export function focus(topic) {
   inspected.value = null
   tell('focus', { topic })
+}
+
+let keeping = 0
+
+/** Keep the newest of these in `shelf`: pairs of a filter and messages a second. */
+export function keep(wanted) {
+  keeping += 1
+  shelf.value = { topics: new Map(), refused: [] }
+  tell('keep', { run: keeping, wanted })
+}
+
+function takeShelf({ changes, refused }) {
+  const old = shelf.peek()
+  if (changes.length === 0 && refused.length === old.refused.length) return
+  const topics = new Map(old.topics)
+  for (const [topic, entry] of changes) {
+    if (entry === null) topics.delete(topic)
+    else topics.set(topic, entry)
+  }
+  shelf.value = { topics, refused }
 }
 
 /** The answer to a call of a service, an action or a verb, as text. Rejects with its error. */

@@ -12,6 +12,7 @@ const PAGES = [
   ['overview', 'Overview'],
   ['topics', 'Topics'],
   ['drive', 'Drive'],
+  ['calls', 'Calls'],
   ['camera', 'Camera'],
   ['map', 'Map'],
   ['clients', 'Clients'],
@@ -21,6 +22,7 @@ const PAGES = [
 const LOADERS = {
   topics: () => import('./topics.js'),
   drive: () => import('./drive.js'),
+  calls: () => import('./calls.js'),
   camera: () => import('./camera.js'),
   map: () => import('./map.js'),
   clients: () => import('./clients.js'),

@@ -4,6 +4,7 @@
 import mqtt from './vendor/mqtt.esm.js'
 import { Drive } from './drive-link.js'
 import { Focus } from './focus.js'
+import { Shelf } from './shelf.js'
 import { cut, preview } from './formats.js'
 
 const TOPICS = 20000 // that are kept; of more the number is told
@@ -17,6 +18,8 @@ let login = null
 let survey = null
 let focus = null
 let drive = null
+let shelf = null
+let keeping = { run: 0, wanted: [] } // what the open page wants kept
 let desk = null // the connection for calls, once somebody calls
 let state = { name: 'out', reason: '' }
 let topics = new Map()
@@ -68,6 +71,10 @@ function signIn({ url, user, password }) {
     const granted = await subscribe(client, ['#', '$SYS/#'], MAX_RATE)
     if (client === survey && granted[0] >= 0x80) state.reason = 'This user may read no topic.'
     focus ??= new Focus(() => open({}, FOCUS_PACKET), takeAbout)
+    if (shelf === null) {
+      shelf = new Shelf(focus.client)
+      shelf.look(keeping)
+    }
     drive ??= new Drive((more) => open(more, SURVEY_PACKET))
   })
   client.on('message', take)
@@ -96,10 +103,10 @@ function end(reason) {
 
 function signOut() {
   unwatch()
-  for (const each of [focus, drive]) each?.stop()
+  for (const each of [focus, drive, shelf]) each?.stop()
   desk?.stop()
   survey?.end(true)
-  survey = focus = drive = desk = login = null
+  survey = focus = drive = shelf = desk = login = null
   topics = new Map()
   changed = new Set()
   about = new Map()
@@ -197,6 +204,7 @@ async function frame() {
   }
   told.focus = (await focus?.told()) ?? null
   told.drive = drive?.told() ?? null
+  told.shelf = (await shelf?.told()) ?? null
   return told
 }
 
@@ -227,6 +235,10 @@ const calls = {
   watch,
   unwatch,
   next: () => viewer?.next(),
+  keep: (values) => {
+    keeping = values
+    shelf?.look(values)
+  },
   request: async (values) => (await calling()).request(values),
   publish: async (values) => (await calling()).publish(values),
 }
