@@ -98,7 +98,7 @@ def test_goals(visit: Callable[..., Visit], robot: Robot) -> None:
     page.reload()
     page.wait_for_selector("form")
     page = opened(visited, "/turtle/walk")
-    page.wait_for_selector(f"{running}:has-text('sent here')")
+    page.wait_for_selector(f"{running} [aria-label=Feedback]")
     wait_for_change(page, f"{running} [aria-label=Feedback]")
     page.wait_for_selector(".call:has(strong:text-is('succeeded')) [aria-label=Result]")
     page.click(f"{running} button:text-is('Cancel')")

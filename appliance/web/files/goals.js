@@ -7,8 +7,10 @@ import { valueOf } from './json-text.js'
 
 const SHOWN = 30 // goals, the newest first
 const FEEDBACK_RATE = 10 // a second
-const OWN = 100 // ids that are remembered
+const OWN = 100 // goals of this page that are remembered
 const RUNNING = new Set(['accepted', 'executing'])
+
+const sent = new Map() // goal id → {mqtt, at}, until the page is loaded again
 
 export default function Goals({ entry }) {
   const { mqtt, type } = entry
@@ -20,7 +22,7 @@ export default function Goals({ entry }) {
   const send = async (payload) => {
     setState({ isBusy: true, error: '' })
     try {
-      remember(mqtt, valueOf(await request(`${mqtt}/_goal`, payload, patience(entry))))
+      remember(mqtt, valueOf(await request(`${mqtt}/_goal`, payload, patience(entry)))?.goal_id)
       setState({ isBusy: false, error: '' })
     } catch (error) {
       setState({ isBusy: false, error: error.message })
@@ -40,14 +42,22 @@ export default function Goals({ entry }) {
     ${goals.length > SHOWN && html`<p class="quiet">… ${goals.length - SHOWN} older ones</p>`}`
 }
 
-/** All goals of an action: those of `_status`, of this browser, and those with feedback or a result. */
+function remember(mqtt, id) {
+  if (typeof id !== 'string') return
+  sent.set(id, { mqtt, at: Math.round(Date.now() / 1000) })
+  if (sent.size > OWN) sent.delete(sent.keys().next().value)
+}
+
+/** All goals of an action: those of `_status`, of this page, and those with feedback or a result. */
 function goalsOf(mqtt, topics) {
   const goals = new Map()
   const goal = (id) => {
     if (!goals.has(id)) goals.set(id, { id, status: '', at: 0, isOwn: false, feedback: null, result: null })
     return goals.get(id)
   }
-  for (const [id, at] of own(mqtt)) Object.assign(goal(id), { isOwn: true, at })
+  for (const [id, own] of sent) {
+    if (own.mqtt === mqtt) Object.assign(goal(id), { isOwn: true, at: own.at })
+  }
   const known = valueOf(topics.get(`${mqtt}/_status`)?.text ?? '[]')
   for (const each of Array.isArray(known) ? known : []) {
     if (typeof each?.goal_id !== 'string') continue
@@ -92,20 +102,4 @@ function Goal({ goal, entry, rights }) {
       <${Json} text=${feedback.text} label="Feedback" />`}
     ${result && html`<p class="quiet">Result</p><${Json} text=${result.text} label="Result" />`}
   </article>`
-}
-
-// --- the goals of this browser, also after the page was loaded again ----------------------------
-
-/** Pairs of an id and when it was sent, in seconds. */
-function own(mqtt) {
-  const all = valueOf(sessionStorage.getItem('goals') ?? '[]')
-  if (!Array.isArray(all)) return []
-  return all.filter((each) => each?.[0] === mqtt && typeof each[1] === 'string').map(([, id, at]) => [id, Number(at) || 0])
-}
-
-function remember(mqtt, answer) {
-  if (typeof answer?.goal_id !== 'string') return
-  const all = valueOf(sessionStorage.getItem('goals') ?? '[]')
-  const goals = [...(Array.isArray(all) ? all : []), [mqtt, answer.goal_id, Math.round(Date.now() / 1000)]]
-  sessionStorage.setItem('goals', JSON.stringify(goals.slice(-OWN)))
 }
