@@ -12,11 +12,16 @@ const MOST_QUESTIONS = 200 // of the verb `rights` in one call
 const LONGEST = 600 // seconds that an answer is waited for
 const RESERVE = 2 // seconds until the appliance's own answer, that time is over, has come
 
-/** Keep topics while a page is open: pairs of a filter and messages a second. */
+/** Keep topics while a page is open and can be seen: pairs of a filter and messages a second. */
 export function useShelf(wanted) {
   useEffect(() => {
-    keep(wanted)
-    return () => keep([])
+    const change = () => keep(document.hidden ? [] : wanted)
+    change()
+    document.addEventListener('visibilitychange', change)
+    return () => {
+      document.removeEventListener('visibilitychange', change)
+      keep([])
+    }
   }, [JSON.stringify(wanted)])
   return shelf.value
 }
@@ -44,8 +49,8 @@ export function lack(rights, topic) {
 /** The line of the ACL that is missing for something. */
 export function Lacking({ line, what }) {
   if (!line || line === '…') return null
-  return html`<p class="notice">This user may not ${what}. The access rules would need the line:
-    <code>${line}</code></p>`
+  return html`<p class="notice">This user may not ${what}. The access rules would
+    need the line: <code>${line}</code></p>`
 }
 
 export function Refused({ told }) {

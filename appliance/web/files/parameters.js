@@ -67,6 +67,7 @@ export default function Parameters({ entry }) {
     if (value === edited(type, text)) next.delete(name)
     else next.set(name, { type, text: value })
     setDrafts(next)
+    setState({ isBusy: false, error: '', done: '' })
   }
   const lacksSeveral = changed.length > 1 && several
   return html`
