@@ -90,7 +90,7 @@ export function Request({ schema, word, lacking, isBusy, send }) {
       aria-invalid=${fault ? 'true' : null} value=${filled}
       onInput=${(event) => setText(event.currentTarget.value)}></textarea></label>
     ${fault && html`<p class="bad" role="alert">${fault}</p>`}
-    <div class="tools"><button class="main" disabled=${Boolean(lacking) || isBusy}>${word}</button>
+    <div class="tools"><button disabled=${Boolean(lacking) || isBusy}>${word}</button>
       <button type="button" disabled=${text === null} onClick=${() => { setText(null); setFault('') }}>Defaults</button></div>
     ${schema && html`<details><summary>Schema</summary><${Json} text=${schema.text} label="Schema" /></details>`}
   </form>`

@@ -87,7 +87,7 @@ export default function Parameters({ entry }) {
       ${parameters.length > SHOWN && html`<p class="quiet">… ${parameters.length - SHOWN} more: search for them</p>`}
       ${lacksSeveral && html`<${Lacking} line=${several} what="set several at once" />`}
       <div class="tools">
-        <button class="main" disabled=${changed.length === 0 || Boolean(wrong) || Boolean(lacksSeveral) || state.isBusy}>
+        <button disabled=${changed.length === 0 || Boolean(wrong) || Boolean(lacksSeveral) || state.isBusy}>
           ${changed.length > 1 ? `Set ${changed.length}, all or none` : 'Set'}</button>
         <button type="button" disabled=${changed.length === 0} onClick=${() => setDrafts(new Map())}>Undo</button></div>
       ${state.error && html`<p class="notice bad" role="alert">${state.error}</p>`}
