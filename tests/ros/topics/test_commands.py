@@ -336,6 +336,23 @@ async def test_who_is_refused_for_a_lease_is_told_who_holds_it(harness, qos, com
     assert "/cmd_vel, and the route is exclusive" in packet.properties[Property.REASON_STRING]
 
 
+@pytest.mark.parametrize("qos", [1, 2])
+async def test_who_may_not_command_is_not_told_who_does(harness, monkeypatch, qos):
+    harness.start(CommandRules(exclusive=True, lease=60))
+    a, b = Driver(harness.broker, "a"), Driver(harness.broker, "b")
+    a.drive()
+
+    def decide(identity, action, topic):
+        return Decision(identity.client_id != "b", "no rule lets it")
+
+    monkeypatch.setattr(harness.broker.access, "decide", decide)
+    harness.broker.router.changed()
+    b.drive(qos=qos)
+    packet = decode(b.wire.written)
+    assert packet.reason_code == 0x87
+    assert "'a'" not in str(packet.properties)
+
+
 async def test_who_commands_is_announced_soon(harness):
     bridge = harness.start(CommandRules(exclusive=True, lease=60))
     bridge._meter_timer.cancel()  # which announces every 10 s
