@@ -8,9 +8,12 @@ from appliance.access.login import LoginPlugins, LoginPolicy, no_user
 from appliance.access.passwords import Passwords, check_password, check_username
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.rules import Permission, Rule
+from appliance.access.tokens import LIFETIME as TOKEN_LIFETIME
+from appliance.access.tokens import is_token
 from appliance.broker.values import Refusal
 
 __all__ = [
+    "TOKEN_LIFETIME",
     "AccessFileError",
     "Acl",
     "ActionVerdict",
@@ -27,5 +30,6 @@ __all__ = [
     "Rules",
     "check_password",
     "check_username",
+    "is_token",
     "no_user",
 ]

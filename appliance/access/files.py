@@ -18,6 +18,7 @@ from appliance.access.passwords import Passwords
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.scram import METHOD, ScramExchange, Verifier
 from appliance.access.throttle import LoginThrottle, RecentKeys
+from appliance.access.tokens import Token, Tokens, is_token
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.host.addresses import network_prefix
@@ -49,6 +50,12 @@ _NO_MANAGEMENT: Final = Decision(False, "no ACL file: nobody may manage the appl
 #: Topics of calls of the appliance itself begin so.
 _CONTROL: Final = "$CONTROL/"
 
+_NO_TOKEN: Final = Refusal(
+    ReasonCode.NOT_AUTHORIZED, "its token is unknown here, has ended, or is another user's"
+)
+_TOO_MANY_TOKENS: Final = Refusal(
+    ReasonCode.QUOTA_EXCEEDED, "too many users are signed in: no token is left"
+)
 _STOPPING: Final = Refusal(ReasonCode.SERVER_SHUTTING_DOWN, "the appliance is stopping")
 _TOO_MANY: Final = Refusal(ReasonCode.SERVER_BUSY, "too many passwords wait to be checked")
 _TRY_LATER: Final = Refusal(
@@ -163,6 +170,7 @@ class FileAccess:
         self._closed = False
         self._max_wait = max_wait
         self.throttle = LoginThrottle(failed_logins)
+        self.tokens = Tokens()
         # Of two cores one is left to the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
         self._hashing: HashingPool[str | None] = HashingPool(workers, max_waiting)
@@ -190,6 +198,11 @@ class FileAccess:
             for username, (login, stored) in self._verified.items()
             if stored == self._passwords.hash_of(username)
         }
+        ended = self.tokens.end_outdated(self._passwords.hash_of)
+        if ended:
+            _log.info(
+                "%d tokens of users with another password, or removed ones, have ended", ended
+            )
         self.epoch += 1
         return Changes.between(before, rules)
 
@@ -295,6 +308,41 @@ class FileAccess:
                 return Identity(username, client_id)
             what = "unknown user" if stored is None else "wrong password for user"
             return Refusal(ReasonCode.NOT_AUTHORIZED, f"{what} {quote(username)}")
+
+    def by_token(self, username: str | None, token: bytes, client_id: str) -> Identity | Refusal:
+        """Who the client is by its token, see `is_token`; the user name may be left out."""
+        found = self._valid(token)
+        if found is None or username not in (None, found.username):
+            return _NO_TOKEN
+        return Identity(found.username, client_id)
+
+    def _valid(self, token: bytes) -> Token | None:
+        found = self.tokens.find(token)
+        if found is not None and found.stored == self._passwords.hash_of(found.username):
+            return found
+        return None
+
+    async def issue_token(self, username: str, password: bytes, address: str) -> str | Refusal:
+        """A token of the user for its password, which is checked as at a login.
+
+        For a token there is none: no token would ever end.
+        """
+        if is_token(password):
+            return _NO_TOKEN
+        who = await self.authenticate(username, password, "", address)
+        if isinstance(who, Refusal):
+            return who
+        stored = self._passwords.hash_of(username)
+        assert stored is not None  # `authenticate` has just found it
+        return self.tokens.issue(username, stored) or _TOO_MANY_TOKENS
+
+    def end_token(self, username: str, token: bytes) -> bool:
+        """End a token of this user; returns whether there was one."""
+        found = self.tokens.find(token)
+        if found is None or found.username != username:
+            return False
+        self.tokens.end(token)
+        return True
 
     def _reserve(self, address: str, login: bytes) -> float | None:
         """Reserve a check for the login; returns the seconds until then, None when too many."""

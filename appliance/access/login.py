@@ -4,13 +4,14 @@ The first of these that applies decides about a CONNECT:
 
 1. **The client's certificate**, where `broker.tls.username_from` takes the user from it: no
    password is asked for, and a CONNECT that names another user is refused.
-2. **The users file**, for a user that has a line in it; without plugins that authenticate,
+2. **A token** (`tokens.py`) in the place of the password. The user name may be left out.
+3. **The users file**, for a user that has a line in it; without plugins that authenticate,
    for every user.
-3. **Anonymous access**, for a client without a user name, as `broker.anonymous` or the client's
+4. **Anonymous access**, for a client without a user name, as `broker.anonymous` or the client's
    listener says. A listener that says no has the last word, plugins or not.
-4. **amqtt's plugins**, where some that authenticate are configured.
+5. **amqtt's plugins**, where some that authenticate are configured.
 
-SCRAM (enhanced authentication) is step 2 with a proof in the place of the password. It is not
+SCRAM (enhanced authentication) is step 3 with a proof in the place of the password. It is not
 offered where step 1 has decided already, nor beside plugins that authenticate: it would bypass
 those that refuse the client.
 """
@@ -22,6 +23,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from appliance.access.files import FileAccess
+from appliance.access.tokens import is_token
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Identity, Refusal
 from appliance.mqtt.codec import quote
@@ -123,6 +125,8 @@ class LoginPolicy:
         if owner is not None:
             return _by_certificate(owner, connect), None
         plugins, files, username = self._plugins, self._files, connect.username
+        if connect.password is not None and is_token(connect.password):
+            return files.by_token(username, connect.password, connect.client_id), None
         is_known = plugins is None or not plugins.authenticates or files.knows(username)
         if is_known or username is None:
             who = await files.authenticate(

@@ -23,6 +23,7 @@ from argon2.exceptions import InvalidHashError, VerificationError
 from appliance.access import scram
 from appliance.access.problems import AccessFileError, FileProblem, read_text
 from appliance.access.rewriting import locked, replacing
+from appliance.access.tokens import is_token
 
 _log = logging.getLogger(__name__)
 
@@ -193,6 +194,8 @@ class Passwords:
         check_username(username)
         if not password:
             raise ValueError("a password must not be empty")
+        if is_token(password.encode() if isinstance(password, str) else password):
+            raise ValueError("a password must not look like a token, which it would be taken for")
         if for_scram is None:
             for_scram = username in self._verifiers
         stored = _scram_hash(username, password) if for_scram else _HASHER.hash(password)

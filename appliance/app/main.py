@@ -313,6 +313,7 @@ class App:
                 lambda: self.upstreams,
                 lambda: self._reload if self._status is not None else None,
                 self._lag,
+                self._access.tokens,
             )
         )
 

@@ -16,6 +16,7 @@ from appliance.management.clients import ClientVerbs
 from appliance.management.examination import DoctorVerb
 from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
+from appliance.management.tokens import TokenVerbs
 from appliance.management.users import UserVerbs
 from appliance.management.verbs import Arguments, Caller, Verb, Verbs
 from appliance.net.callbacks import Entries
@@ -62,6 +63,7 @@ def verbs(parts: ManagementParts) -> Verbs:
         *ClientVerbs(parts.broker).verbs(),
         *RightsVerbs(parts.broker, parts.access).verbs(),
         *UserVerbs(parts.access, take_over).verbs(),
+        *TokenVerbs(parts.broker, parts.access).verbs(),
         *CertificateVerbs(lambda: authority_directory(reload.settings.broker), take_over).verbs(),
         # Its path changes with a restart only.
         *RecordVerbs(reload.settings.broker.audit.path).verbs(),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import psutil
 
 from appliance import certs
+from appliance.access.tokens import Tokens
 from appliance.app.reload import Reload
 from appliance.app.status import endings
 from appliance.broker.broker import Broker
@@ -64,6 +65,7 @@ class MetricsParts:
     upstreams: Callable[[], Sequence[Uplink]]
     reload: Callable[[], Reload | None]
     lag: Histogram
+    tokens: Tokens
 
 
 class Metrics:
@@ -129,6 +131,11 @@ class Metrics:
             "Logins with a wrong password or without the right to come in, over HTTP too.",
             counters.logins_failed,
         )
+        tokens = self._parts.tokens
+        found.gauge(
+            "tokens", "Tokens that are in force, with which users stay signed in.", len(tokens)
+        )
+        found.counter("tokens_issued_total", "Tokens that were issued.", tokens.issued)
         for name, received, sent, about in (
             ("packets", counters.messages_received, counters.messages_sent, "MQTT packets"),
             (

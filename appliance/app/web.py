@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from appliance.access import LoginPolicy, no_user
+from appliance.access.tokens import Tokens
 from appliance.app.metrics import Metrics, MetricsParts
 from appliance.app.reload import Reload
 from appliance.broker.broker import Broker
@@ -47,6 +48,7 @@ class WebParts:
     upstreams: Callable[[], Sequence[Uplink]]
     reload: Callable[[], Reload | None]
     lag: Histogram
+    tokens: Tokens
 
 
 def site(parts: WebParts) -> WebSite:
@@ -62,6 +64,7 @@ def site(parts: WebParts) -> WebSite:
             parts.upstreams,
             parts.reload,
             parts.lag,
+            parts.tokens,
         )
     )
     return WebSite(

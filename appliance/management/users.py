@@ -23,7 +23,7 @@ from appliance.ros.calls.dispatcher import CallError
 TIMEOUT: Final = 60.0
 
 #: Characters of a password: a long one is no more work than a short one.
-_LONGEST_PASSWORD: Final = 1024
+LONGEST_PASSWORD: Final = 1024
 _LONGEST_NAME: Final = 256
 _MOST_GROUPS: Final = 32
 
@@ -44,7 +44,7 @@ class OneUser(Arguments):
 class UserPassword(OneUser):
     """A user's new password; `scram` stores it for SCRAM, None as it is stored now."""
 
-    password: Annotated[str, Field(min_length=1, max_length=_LONGEST_PASSWORD)] = field(repr=False)
+    password: Annotated[str, Field(min_length=1, max_length=LONGEST_PASSWORD)] = field(repr=False)
     scram: bool | None = None
 
 

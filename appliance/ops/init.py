@@ -106,6 +106,8 @@ GROUPS = {
 topic read {{robot}}/#
 topic read $SYS/#
 topic write $CONTROL/appliance/v1/rights/_call/#
+topic write $CONTROL/appliance/v1/token/_call/#
+topic write $CONTROL/appliance/v1/token_end/_call/#
 """,
     "drivers.conf": """\
 # Drivers also command the robot.

@@ -1,4 +1,4 @@
-"""Who asks, by HTTP's Basic authentication: the login and the access rules are those of MQTT."""
+"""Who asks, by HTTP's Basic or Bearer authentication: login and access rules are those of MQTT."""
 
 from __future__ import annotations
 
@@ -55,6 +55,8 @@ class WebLogin:
             username, password, request.address, request.tls, request.anonymous
         )
         if isinstance(who, Identity):
+            if who.username is None and password is not None:
+                return text(401, "this is no token")  # and nobody either, where that is enough
             return who
         self._note(request, username, who)
         if who.code in WRONG_LOGIN:
@@ -112,13 +114,18 @@ class WebLogin:
 
 
 def credentials(request: HttpRequest) -> tuple[str | None, bytes | None]:
-    """User name and password of the request; None without them. Raises ValueError (RFC 7617)."""
+    """User name and password of the request; None without them. Raises ValueError.
+
+    Basic (RFC 7617) has both. Bearer (RFC 6750) has a token alone, which stands for a password.
+    """
     given = [value for name, value in request.headers if name == "authorization"]
     if not given:
         return None, None
     scheme, _, encoded = given[0].partition(" ")
+    if len(given) == 1 and scheme.lower() == "bearer":
+        return None, encoded.strip().encode()
     if len(given) > 1 or scheme.lower() != "basic":
-        raise ValueError("Basic authentication is taken here")
+        raise ValueError("Basic authentication is taken here, or a token as Bearer")
     try:
         decoded = base64.b64decode(encoded.strip(), validate=True)
         name, colon, password = decoded.partition(b":")

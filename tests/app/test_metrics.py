@@ -6,6 +6,7 @@ import asyncio
 import base64
 import time
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -84,12 +85,13 @@ async def test_who_may_read_it(web: WebApp):
         (basic("operator", ""), 401),
         ({}, 401),
         ({"Authorization": "Bearer x"}, 401),
+        ({"Authorization": "Digest x"}, 401),
     ):
         found, headers, body = await web.get("/metrics", **given)
         assert found == status, given
         assert "www-authenticate" not in headers
         assert status == 200 or len(body) < 200
-    assert counters.logins_failed == 4  # the last one did not try
+    assert counters.logins_failed == 5  # the last one did not try
     peer = await web.dial()
     assert (await ask(peer, "HEAD /metrics", **RIGHT))[0] == 200
     assert (await ask(peer, "HEAD /metrics"))[0] == 401
@@ -106,6 +108,23 @@ async def test_a_right_or_a_user_that_is_taken_away(web: WebApp):
     await web.app.reload()
     assert (await ask(peer, "GET /metrics", **RIGHT))[0] == 401
     assert (await ask(peer, "GET /metrics", **basic("operator", "another")))[0] == 403
+
+
+async def test_a_token_reads_it(web: WebApp):
+    access = web.app._access
+    token = await access.issue_token("operator", b"right", "127.0.0.1:1")
+    bearer = {"Authorization": f"Bearer {token}"}
+    status, _, body = await web.get("/metrics", **bearer)
+    found = samples(body)
+    assert status == 200
+    assert found["appliance_tokens",] == found["appliance_tokens_issued_total",] == 1
+    assert (await web.get("/metrics", **basic("operator", str(token))))[0] == 200
+    assert (await web.get("/metrics", **basic("bob", str(token))))[0] == 401
+    web.app._login._files._in_force = replace(access.in_force, anonymous=True)
+    assert (await web.get("/metrics", Authorization="Bearer x"))[0] == 401  # not as anybody
+    set_passwords(web.directory / "users.passwd", operator="another")
+    await web.app.reload()
+    assert (await web.get("/metrics", **bearer))[0] == 401
 
 
 async def test_guesses_are_throttled_with_those_of_mqtt(
@@ -199,7 +218,7 @@ build_info clients sessions subscriptions connects_total connects_refused_total 
 packets_received_total packets_sent_total messages_received_total messages_sent_total
 message_bytes_received_total message_bytes_sent_total network_bytes_received_total
 network_bytes_sent_total messages_dropped_total messages_throttled_total messages_refused_total
-retained_messages
+retained_messages tokens tokens_issued_total
 retained_bytes queued_bytes memory_limit_bytes loop_lag_seconds_bucket errors_total
 store_commits_total store_commit_seconds_bucket store_lag_seconds store_bytes store_limit_bytes
 store_failing certificate_expiry_timestamp_seconds reload_success reload_timestamp_seconds

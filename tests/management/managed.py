@@ -70,12 +70,10 @@ class Caller:
         self.version = version
         self._numbers = iter(range(1, 60_000))
 
-    async def connect(self, address: tuple[str, int], user: str, **options: Any) -> None:
+    async def connect(self, address: tuple[str, int], user: str | None, **options: Any) -> None:
         self._peer = Peer(*await asyncio.open_connection(*address), self.version)
-        password = PASSWORD.encode()
-        await self.send(
-            Connect(self.name, version=self.version, username=user, password=password, **options)
-        )
+        options = {"password": PASSWORD.encode(), **options}
+        await self.send(Connect(self.name, version=self.version, username=user, **options))
         connack = await self.receive()
         assert isinstance(connack, Connack) and not connack.reason_code, connack
 

@@ -1,6 +1,6 @@
 """For journeys: an appliance with the console and the demo robot, and a real Chromium.
 
-A file of journeys has its own; it may have a fixture `bridge` with its own bridge.
+A file of journeys has its own; it may have fixtures `bridge`, with its own bridge, and `web_port`.
 """
 
 from __future__ import annotations
@@ -63,12 +63,19 @@ def bridge() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
+def web_port() -> int:
+    """The port of the console; 0 for one that the system chooses anew at each start."""
+    return 0
+
+
+@pytest.fixture(scope="module")
 def appliance(
-    tmp_path_factory: pytest.TempPathFactory, bridge: dict[str, Any]
+    tmp_path_factory: pytest.TempPathFactory, bridge: dict[str, Any], web_port: int
 ) -> Iterator[ApplianceProcess]:
     bind = "127.0.0.1:0"
     web = {"bind": bind, "protocol": "web"}
-    listeners = [{"bind": bind, "tls": True}, {"bind": bind}, {**web, "tls": True}, web]
+    secure = {"bind": f"127.0.0.1:{web_port}", "protocol": "web", "tls": True}
+    listeners = [{"bind": bind, "tls": True}, {"bind": bind}, secure, web]
     process = ApplianceProcess(
         tmp_path_factory.mktemp("console"),
         users={"viewer": PASSWORD},

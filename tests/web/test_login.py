@@ -1,4 +1,4 @@
-"""Basic authentication: what is taken from a request, and what is not."""
+"""Basic and Bearer authentication: what is taken from a request, and what is not."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_nobody():
         "Basic ä",
         basic(b"\xff:x"),
         basic(b"a\0b:x"),
-        "Bearer YWxpY2U6c2VjcmV0",
+        "Digest YWxpY2U6c2VjcmV0",
         basic(b"a:b") + ", " + basic(b"c:d"),
     ],
 )
@@ -58,6 +58,13 @@ def test_what_is_not_one(given: str):
         credentials(request(given))
 
 
+def test_a_token():
+    assert credentials(request("Bearer appliance-token-x ")) == (None, b"appliance-token-x")
+    assert credentials(request("bEARER x")) == (None, b"x")
+
+
 def test_two_are_none():
     with pytest.raises(ValueError, match="Basic"):
         credentials(request(basic(b"a:b"), basic(b"a:b")))
+    with pytest.raises(ValueError, match="Basic"):
+        credentials(request("Bearer x", "Bearer x"))

@@ -29,6 +29,11 @@ export class Drive {
     this.connect()
   }
 
+  /** Connect after the connection was lost, and command nothing. */
+  again() {
+    if (this.client === null && this.route !== null && this.timer === null) this.connect()
+  }
+
   connect() {
     this.state = 'connecting'
     const client = this.open({ reconnectPeriod: 0, keepalive: 2 })
@@ -51,7 +56,7 @@ export class Drive {
   go(linear, angular) {
     this.wanted = [linear, angular]
     this.heard = Date.now()
-    if (this.client === null && this.route !== null && this.timer === null) this.connect()
+    this.again()
     if (this.timer !== null) return
     this.reason = ''
     this.timer = setInterval(() => this.command(), PERIOD)

@@ -4,6 +4,8 @@ import { batch, signal } from './vendor/signals-core.mjs'
 
 const FRAME = 100 // ms between two questions; the values change twice a second
 
+const STORED = 'console' // what this window keeps of a sign-in: the user and a token, no password
+
 export const session = signal({ name: 'out', reason: '' })
 export const user = signal('')
 export const rows = new Map() // topic → signal of its row
@@ -78,7 +80,10 @@ function take(told) {
       }
       robots.value = found
     }
-    if (told.state.name === 'out' || told.state.name === 'refused') forget()
+    if (told.state.name === 'out' || told.state.name === 'refused') {
+      forget()
+      keep(null)
+    } else if (told.token !== null && user.peek()) keep(told.token)
     if (untold.peek() !== told.untold) untold.value = told.untold
     if (!isPaused.peek()) takeRows(told.rows)
     else held.push(...told.rows.slice(0, 1000))
@@ -157,14 +162,41 @@ export async function verb(name, values = {}, timeout = undefined) {
   return JSON.parse(await request(`$CONTROL/appliance/v1/${name}/_call`, JSON.stringify(values), timeout))
 }
 
-export function signIn(name, password) {
+/** Sign in with a password, or with the token of a page before this one. */
+export function signIn(name, password, token) {
   const url = `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/mqtt`
   user.value = name
   session.value = { name: 'connecting', reason: '' }
-  return ask('signIn', { url, user: name, password })
+  return ask('signIn', { url, user: name, password, token })
+}
+
+/** Sign in again after the page was loaded again. */
+export function resume() {
+  try {
+    const { name, token } = JSON.parse(sessionStorage.getItem(STORED)) ?? {}
+    if (typeof name !== 'string' || typeof token !== 'string') return
+    kept = token
+    signIn(name, undefined, token).catch(() => {})
+  } catch {
+    // The browser stores nothing, or what is there is not ours.
+  }
+}
+
+let kept = null
+
+function keep(token) {
+  if (token === kept) return
+  kept = token
+  try {
+    if (token === null) sessionStorage.removeItem(STORED)
+    else sessionStorage.setItem(STORED, JSON.stringify({ name: user.peek(), token }))
+  } catch {
+    // The browser stores nothing: the page asks for the password when it is loaded again.
+  }
 }
 
 export function signOut() {
+  keep(null)
   user.value = ''
   tell('signOut')
 }

@@ -4,7 +4,7 @@ import { h, render } from './vendor/preact.mjs'
 import { useEffect, useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { names, robots, rows, session, signIn, signOut, user } from './link.js'
+import { names, resume, robots, rows, session, signIn, signOut, user } from './link.js'
 
 const html = htm.bind(h)
 
@@ -235,4 +235,5 @@ function Bridge({ robot, routes }) {
   </table></div></section>`
 }
 
+resume()
 render(html`<${Console} />`, document.getElementById('console'))

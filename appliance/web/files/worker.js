@@ -1,5 +1,6 @@
 // The connections, away from the page: it keeps the newest of each topic, and hands the page what
-// has changed when the page asks, once a frame. The password is in this memory only.
+// has changed when the page asks, once a frame. The password is in this memory only. A token stands
+// for it at each login but the first, and the page keeps that for when it is loaded again.
 
 import mqtt from './vendor/mqtt.esm.js'
 import { Drive } from './drive-link.js'
@@ -13,6 +14,8 @@ const SURVEY_PACKET = 32 * 1024
 const FOCUS_PACKET = 12 * 1024 * 1024
 const CHANGES = 500 // topics in one answer to the page
 const MAX_RATE = '2' // messages a second of each topic in the survey
+const TOKEN = 'appliance-token-' // what each begins with
+const WRONG = [0x86, 0x87] // reason codes of a login that is not accepted
 
 let login = null
 let survey = null
@@ -33,11 +36,16 @@ function options(more, packet) {
     protocolVersion: 5,
     clientId: `console-${crypto.getRandomValues(new Uint32Array(2)).join('-')}`,
     username: login.user,
-    password: login.password,
+    // At each connect, as a client that reconnects keeps what it was made with.
+    transformWsUrl: (url, _, client) => {
+      client.options.password = login?.token ?? login?.password
+      return url
+    },
     clean: true,
     keepalive: 15,
     connectTimeout: 10000,
     reconnectPeriod: 1000,
+    reconnectOnConnackError: true, // a token may have ended, and there may be no room for a while
     resubscribe: false,
     queueQoSZero: false,
     timerVariant: 'native',
@@ -47,7 +55,41 @@ function options(more, packet) {
 }
 
 export function open(more, packet) {
-  return mqtt.connect(login.url, options(more, packet))
+  const client = mqtt.connect(login.url, options(more, packet))
+  client.on('error', ({ code }) => {
+    if (!WRONG.includes(code) || !client.options.password?.startsWith(TOKEN)) return
+    if (login?.token === client.options.password) tokenHasEnded()
+    // With the password, and without a pause: it is the robot that has started again.
+    if (login !== null && client.options.reconnectPeriod) setTimeout(() => client.reconnect())
+  })
+  return client
+}
+
+/** With its time, another password, or the appliance: the password gets another one. */
+function tokenHasEnded() {
+  login.token = null
+  if (login.password === undefined) {
+    end({ name: 'refused', reason: 'You were signed out. Sign in again.' })
+  } else if (survey?.connected) {
+    stay()
+  }
+}
+
+/** Get a token. Without the right to that, the page asks for the password when it is loaded again. */
+async function stay() {
+  const { password } = login
+  const mine = login
+  try {
+    const { token } = JSON.parse(await callVerb('token', { password }))
+    mine.token = token
+  } catch {
+    // The password does as well.
+  }
+}
+
+async function callVerb(name, values) {
+  const topic = `$CONTROL/appliance/v1/${name}/_call`
+  return (await calling()).request({ topic, payload: JSON.stringify(values) })
 }
 
 function subscribe(client, filters, rate) {
@@ -59,9 +101,9 @@ function subscribe(client, filters, rate) {
   })
 }
 
-function signIn({ url, user, password }) {
+function signIn({ url, user, password, token }) {
   signOut()
-  login = { url, user, password }
+  login = { url, user, password, token }
   state = { name: 'connecting', reason: '' }
   const client = open({}, SURVEY_PACKET)
   survey = client
@@ -76,6 +118,8 @@ function signIn({ url, user, password }) {
       shelf.look(keeping)
     }
     drive ??= new Drive((more) => open(more, SURVEY_PACKET))
+    drive.again()
+    if (client === survey && !login.token) stay()
   })
   client.on('message', take)
   client.on('error', (error) => {
@@ -83,7 +127,8 @@ function signIn({ url, user, password }) {
     const code = error.code
     const isRefused = typeof code === 'number' && code > 0
     if (isRefused && state.name !== 'in') {
-      const bad = code === 0x86 || code === 0x87 || code === 4 || code === 5
+      const bad = WRONG.includes(code)
+      if (bad && client.options.password !== login.password) return // it tries with the password
       end({ name: 'refused', reason: bad ? 'User name or password is wrong.' : String(error.message) })
     } else if (state.name === 'connecting') {
       state.reason = String(error.message)
@@ -112,6 +157,17 @@ function signOut() {
   about = new Map()
   kept = untold = 0
   state = { name: 'out', reason: '' }
+}
+
+/** Sign out for good: the token ends too, over a connection that outlives the others. */
+async function leave() {
+  const token = login?.token
+  const last = token ? await calling().catch(() => null) : null
+  desk = null
+  signOut()
+  if (last === null) return
+  const values = { topic: '$CONTROL/appliance/v1/token_end/_call', payload: JSON.stringify({ token }) }
+  last.request(values).catch(() => {}).finally(() => last.stop())
 }
 
 // --- what a page watches: pictures or a map, over a connection that ends with the page -----------
@@ -197,7 +253,7 @@ async function frame() {
     const { payload, properties, size, rate, at, retain } = topics.get(topic)
     rows.push([topic, cut(preview(payload, properties), 200), size, rate, at, retain])
   }
-  const told = { state, rows, total: topics.size, untold }
+  const told = { state, rows, total: topics.size, untold, token: login?.token ?? null }
   if (about.size) {
     told.about = [...about]
     about.clear()
@@ -218,7 +274,7 @@ async function calling() {
 
 const calls = {
   signIn,
-  signOut,
+  signOut: leave,
   frame,
   focus: ({ topic }) => {
     const known = topics.get(topic)
