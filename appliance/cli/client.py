@@ -85,6 +85,12 @@ def sub(
         ),
     ] = None,
     qos: Annotated[int, typer.Option("--qos", "-q", min=0, max=2)] = 0,
+    rate: Annotated[
+        bool,
+        typer.Option(
+            "--rate", help="Print before each payload when it came, and the rate of its topic."
+        ),
+    ] = False,
 ) -> None:
     """Subscribe, and print received messages, one per line."""
     from appliance.cli import mqtt_client as client
@@ -96,6 +102,7 @@ def sub(
             qos,
             sys.stdout.buffer,
             verbose=verbose,
+            rate=rate,
             count=count,
             timeout=timeout,
         )

@@ -85,11 +85,9 @@ def _clients(options: ManagedAppliance, wanted: dict[str, Any]) -> Iterator[dict
 
 
 def _row(client: dict[str, Any]) -> tuple[str, ...]:
-    from appliance.ops.logs import VISIBLE
-
     user = client["user"]
     queued = f"{client['queued']}" if client["queued"] else ""
-    cells = (
+    return (
         client["client"],
         "(none)" if user is None else user,
         client.get("address", "not connected"),
@@ -98,4 +96,3 @@ def _row(client: dict[str, Any]) -> tuple[str, ...]:
         queued,
         str(client["subscription_count"]),
     )
-    return tuple(cell.translate(VISIBLE) for cell in cells)

@@ -6,17 +6,20 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
 from appliance.cli.console import (
     CommandError,
     ConfigOption,
+    NotConnectedError,
+    RunningAppliance,
     ask_running,
     load,
     read_password,
@@ -25,6 +28,9 @@ from appliance.cli.console import (
 
 if TYPE_CHECKING:
     from appliance.cli.mqtt_client import ConnectionSettings
+
+#: Asks a verb with its arguments.
+Ask: TypeAlias = Callable[[str, Mapping[str, Any]], Any]
 
 _HERE = "localhost"
 
@@ -170,26 +176,50 @@ class ManagedAppliance(ConnectionOptions):
     def _settings(self) -> ConnectionSettings:
         return self.target()  # it may ask for the password: once
 
+    def prepare(self) -> None:
+        """Read or ask for all that a connection needs. Raises CommandError."""
+        if self.is_remote:
+            _ = self._settings
+
     def ask(self, verb: str, arguments: Mapping[str, Any]) -> Any:
         """What it answers. Raises CommandError."""
+        if self.is_remote:
+            with self.asking() as ask:
+                return ask(verb, arguments)
+        answer, mistake = ask_running(self.config, verb, arguments)
+        warn(mistake)
+        return answer
+
+    @contextmanager
+    def asking(self) -> Iterator[Ask]:
+        """What asks it, as `ask` does, again and again and over one connection.
+
+        Raises NotConnectedError, as what it yields does when this connection is of no more use.
+        """
         if not self.is_remote:
-            answer, mistake = ask_running(self.config, verb, arguments)
-            warn(mistake)
-            return answer
-        from appliance.cli.mqtt_client import ClientError
-        from appliance.cli.rpc_client import RpcClient
+            yield RunningAppliance(self.config).ask
+            return
+        from appliance.cli.mqtt_client import ClientError, RefusedError
+        from appliance.cli.rpc_client import CallFailedError, RpcClient
         from appliance.management.topics import topic_of
+
+        def ask(verb: str, arguments: Mapping[str, Any]) -> Any:
+            payload = json.dumps(arguments).encode()
+            try:
+                return json.loads(client.call(topic_of(verb), payload, _ANSWER_TIMEOUT))
+            except (CallFailedError, RefusedError) as error:
+                raise CommandError(str(error)) from None
+            except ClientError as error:
+                raise NotConnectedError(str(error)) from None
 
         try:
             client = RpcClient(self._settings)
-            try:
-                return json.loads(
-                    client.call(topic_of(verb), json.dumps(arguments).encode(), _ANSWER_TIMEOUT)
-                )
-            finally:
-                client.close()
         except ClientError as error:
-            raise CommandError(str(error)) from None
+            raise NotConnectedError(str(error)) from None
+        try:
+            yield ask
+        finally:
+            client.close()
 
 
 def _is_configured() -> bool:

@@ -41,6 +41,10 @@ class CommandError(Exception):
     """Its message is printed as it is; the command ends with exit code 1."""
 
 
+class NotConnectedError(CommandError):
+    """Nobody answers there now; later somebody may."""
+
+
 def load(config: Path | None) -> Settings:
     """The settings. Raises CommandError when they are invalid."""
     from appliance.config import ConfigError
@@ -61,24 +65,45 @@ def ask_running(
     Raises:
         CommandError: it has not answered.
     """
-    from appliance.config import load_control
-    from appliance.ops.control import ControlError, NotRunningError, ask
+    running = RunningAppliance(config)
+    return running.ask(command, arguments or {}), running.mistake
 
-    broken: CommandError | None = None
-    try:
-        settings = load(config)
-    except CommandError as error:
-        broken, settings = error, load_control(config)
-    try:
-        answer = ask(settings.control, command, arguments=arguments)
-    except NotRunningError as error:
-        raise broken or CommandError(str(error)) from None
-    except ControlError as error:
-        raise CommandError(str(error)) from None
-    if broken is None:
-        return answer, ""
-    told = str(broken).replace("\n", ": ", 1).replace("\n", "; ")
-    return answer, f"what is in force is older than the file: {told}"
+
+class RunningAppliance:
+    """The running appliance of a configuration, asked over its control socket."""
+
+    def __init__(self, config: Path | None) -> None:
+        from appliance.config import load_control
+
+        self._broken: CommandError | None = None
+        try:
+            self._control = load(config).control
+        except CommandError as error:
+            self._broken, self._control = error, load_control(config).control
+
+    def ask(self, command: str, arguments: Mapping[str, Any]) -> Any:
+        """What it answers.
+
+        Raises:
+            NotConnectedError: no appliance is running.
+            CommandError: it has not answered.
+        """
+        from appliance.ops.control import ControlError, NotRunningError, ask
+
+        try:
+            return ask(self._control, command, arguments=arguments)
+        except NotRunningError as error:
+            raise NotConnectedError(str(self._broken or error)) from None
+        except ControlError as error:
+            raise CommandError(str(error)) from None
+
+    @property
+    def mistake(self) -> str:
+        """What is wrong with the configuration file; empty when nothing is."""
+        if self._broken is None:
+            return ""
+        told = str(self._broken).replace("\n", ": ", 1).replace("\n", "; ")
+        return f"what is in force is older than the file: {told}"
 
 
 def warn(text: str) -> None:
@@ -136,11 +161,9 @@ def shown(path: Path) -> str:
 
 
 def print_table(rows: Iterable[tuple[str, ...]]) -> None:
-    """Print columns as wide as necessary: nothing is cut off for programs that read them."""
-    lines = list(rows)
-    columns = max(map(len, lines), default=0)
-    padded = [(*row, *[""] * (columns - len(row))) for row in lines]
-    widths = [max(map(len, column)) for column in zip(*padded, strict=True)]
-    for row in padded:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        typer.echo(line.rstrip())
+    """Print columns that fit the terminal; nothing is cut off for programs that read them. What
+    would control a terminal is escaped."""
+    from appliance.cli.tables import table, terminal_width
+
+    for line in table(rows, terminal_width()):
+        typer.echo(line)

@@ -25,6 +25,7 @@ from appliance.cli.routes import routes
 from appliance.cli.running import bench, check, demo, init, reload, run
 from appliance.cli.status import status
 from appliance.cli.store import store_app
+from appliance.cli.top import top
 from appliance.cli.upstream import upstream
 
 app = typer.Typer(
@@ -35,7 +36,7 @@ app = typer.Typer(
 )
 # In this order in the help.
 SETTING_UP = (init, run, check, reload)
-LOOKING = (status, doctor, routes, upstream)
+LOOKING = (status, top, doctor, routes, upstream)
 USING = (pub, sub, call, goal)
 for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)

@@ -17,6 +17,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from appliance.cli.arrivals import Arrivals
 from appliance.ops.logs import VISIBLE, VISIBLE_IN_LINES
 
 ANSWER_TIMEOUT = 10.0  # seconds to wait for an acknowledgement
@@ -114,24 +115,29 @@ def subscribe(
     output: BinaryIO,
     *,
     verbose: bool = False,
+    rate: bool = False,
     count: int | None = None,
     timeout: float | None = None,
 ) -> int:
     """Write received messages to `output`, one per line; returns their number.
 
+    A line begins with the topic if `verbose`, and before that with `Arrivals.note` if `rate`.
     Ends after `count` messages or `timeout` seconds, whichever is first; without either it runs
     until interrupted. Raises ClientError, also when the broker ends the connection.
     """
     received = 0
+    arrivals = Arrivals()
 
     def show(message: paho.MQTTMessage) -> None:
         nonlocal received
         if count is not None and received >= count:
             return
         received += 1
-        line = (
-            message.topic.encode() + b" " + message.payload if verbose else bytes(message.payload)
-        )
+        line = bytes(message.payload)
+        if verbose:
+            line = message.topic.encode() + b" " + line
+        if rate:
+            line = arrivals.note(message.topic).encode() + b"  " + line
         write_line(output, line)
 
     connection = MqttClient(target, show)

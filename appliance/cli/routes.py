@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
@@ -13,6 +14,9 @@ from appliance.cli.console import ConfigOption, ask_running, print_table, warn
 ARROWS = {"to_mqtt": "→", "to_ros": "←"}
 HEAD = ("ROS", "", "MQTT", "TYPE", "AS")
 METRICS = ("HZ", "BYTES", "LOST", "DROPPED", "SLOW", "THROTTLED", "REFUSED", "ERRORS", "MS")
+
+#: Columns where the terminal is too narrow for all: the others are below each line.
+SHORT_HEAD = ("ROS", "", "MQTT", "HZ", "BYTES", "MS")
 
 #: Texts of the summary, by the value of `why`.
 WHY = {
@@ -51,8 +55,7 @@ def routes(
         typer.echo("".join(f"{json.dumps(entry)}\n" for entry in entries), nl=False)
         return
     if bridged:
-        rows = map(_row, sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
-        print_table([(*HEAD, *METRICS), *rows])
+        _print_bridged(sorted(bridged, key=lambda entry: (entry["ros"], entry["direction"])))
         _print_errors(bridged)
         if any(entry.get("lost") for entry in bridged):
             from appliance.ros.ros2.fastdds import LOST_IN_ROS
@@ -63,6 +66,39 @@ def routes(
     if skipped:
         shown = [entry for entry in skipped if entry["why"] != COUNTED][:SHOWN]
         _print_skipped(skipped, skipped if show_all else shown)
+
+
+def _print_bridged(bridged: list[dict[str, Any]]) -> None:
+    """A line for each or, where the terminal is too narrow, two."""
+    from appliance.cli.tables import GAP, table, terminal_width, visible
+
+    width = terminal_width()
+    lines = list(table([(*HEAD, *METRICS), *map(_row, bridged)]))
+    if width is None or max(map(len, lines)) <= width:
+        for line in lines:
+            typer.echo(line)
+        return
+    head, *lines = table([SHORT_HEAD, *map(_short_row, bridged)], width)
+    typer.echo(head)
+    for entry, line in zip(bridged, lines, strict=True):
+        typer.echo(line)
+        details = [f"{entry['type']} as {entry['encoding']}", *_not_carried(entry)]
+        for more in table([("", visible("; ".join(details)))], width - len(GAP)):
+            typer.echo(f"{GAP}{more}")
+
+
+def _short_row(entry: dict[str, Any]) -> tuple[str, ...]:
+    row = dict(zip((*HEAD, *METRICS), _row(entry), strict=False))
+    texts = (row.get(name, "").replace(" / ", "/") for name in SHORT_HEAD[2:])
+    return (row["ROS"], row[""], *texts)
+
+
+def _not_carried(entry: dict[str, Any]) -> Iterator[str]:
+    """The counters that are not 0."""
+    row = dict(zip((*HEAD, *METRICS), _row(entry), strict=False))
+    for name in METRICS:
+        if name not in SHORT_HEAD and row.get(name, "0") != "0":
+            yield f"{name.lower()} {row[name]}"
 
 
 def _row(entry: dict[str, Any]) -> tuple[str, ...]:
@@ -87,7 +123,7 @@ def _print_errors(bridged: list[dict[str, Any]]) -> None:
     failed = [entry for entry in bridged if entry.get("last_error")]
     for entry in sorted(failed, key=lambda entry: (entry["ros"], entry["direction"])):
         way = ARROWS.get(entry["direction"], entry["direction"])
-        typer.echo(f"{entry['ros']} {way}  last error: {entry['last_error']}")
+        print_table([(f"{entry['ros']} {way}", f"last error: {entry['last_error']}")])
 
 
 def _print_skipped(skipped: list[dict[str, str]], shown: list[dict[str, str]]) -> None:
