@@ -98,7 +98,8 @@ command.GROWTH = tuple(
 
 #: Commands that are for a running appliance, and those that want it stopped; others do not mind.
 NEED_RUNNING = re.compile(
-    r"appliance (status|top|reload|routes|clients|upstream|doctor|pub|sub|call|goal|param) |mosquitto_"
+    r"appliance (status|top|reload|routes|clients|upstream|doctor|pub|sub|call|goal|param) "
+    r"|mosquitto_"
 )
 NEED_STOPPED = re.compile(r"appliance (run|store) |make run ")
 #: They run until they are stopped.
