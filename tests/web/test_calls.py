@@ -82,7 +82,7 @@ def test_a_service(visit: Callable[..., Visit], robot: Robot) -> None:
 
 def test_goals(visit: Callable[..., Visit], robot: Robot) -> None:
     """Feedback while it runs, cancelling, results, and all of it after the page came anew."""
-    visited = visit(**DESKTOP)
+    visited = visit(color_scheme="dark", **DESKTOP)
     page = opened(visited, "/turtle/walk")
     ask(page, '{"order": 3}', "Send goal")
     page.wait_for_selector(".call:has(strong:text-is('succeeded')) [aria-label=Result]")
@@ -163,11 +163,21 @@ def test_a_viewer_is_told_which_lines_are_missing(
     visit: Callable[..., Visit], robot: Robot, appliance: ApplianceProcess
 ) -> None:
     """Every control is disabled, with the line of the ACL that would allow it."""
-    visited = visit(**DESKTOP)
+    visited = visit(color_scheme="dark", **PHONE)
     page = opened(visited, "/turtle/pen", "viewer")
-    page.wait_for_selector(".notice")
+    page.wait_for_selector(f".notice code:text-is('topic write {TURTLE}/pen/_call')")
     assert page.is_disabled("button:text-is('Call')")
-    visited.look("desktop-calls-4-viewer")
+    visited.look("phone-calls-4-viewer")
+    page.click("text=Close")
+    visited.look("phone-calls-5-list")
+    page.click(".row:has(bdi:text-is('/turtle/walk'))")
+    for right in ("_goal", "_cancel"):
+        page.wait_for_selector(f".notice code:text-is('topic write {TURTLE}/walk/{right}')")
+    assert page.is_disabled("button:text-is('Send goal')")
+    page.click("text=Close")
+    page.click(".row:has(bdi:text-is('/turtle'))")
+    page.wait_for_selector(f".notice code:text-is('topic write {TURTLE}/_param/_set')")
+    page.wait_for_selector(".parameter:has(bdi:text-is('mode')) input:disabled")
 
 
 HOSTILE = {

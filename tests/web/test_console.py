@@ -151,7 +151,7 @@ def test_the_libraries_are_those_of_npm():
             assert (VENDOR / here).read_bytes() == original.read_bytes(), here
 
 
-@pytest.mark.parametrize("name", ["formats", "camera", "map"])
+@pytest.mark.parametrize("name", ["formats", "camera", "map", "calls"])
 def test_hostile_payloads(name: str):
     """What reads payloads, in node: exact, bounded, and no key becomes one of an object."""
     install()

@@ -2,11 +2,13 @@
 
 const DEPTH = 32 // levels that are indented
 const SHOWN = 64 * 1024 // characters
+const LINES = 20000 // and so many words of JSON, with what is between them
 
 /** JSON with a line for each value. What is longer is cut, and says so; what is no JSON stays as it is. */
 export function indented(text) {
   const some = text.slice(0, SHOWN)
-  const rest = text.length > SHOWN ? `\n… cut: ${text.length} characters in all` : ''
+  const cut = `\n… cut: ${text.length} characters in all`
+  const rest = text.length > SHOWN ? cut : ''
   if (!/^\s*[{[]/.test(some)) return some + rest
   const parts = some.match(/"[^"\\]*(?:\\.[^"\\]*)*"?|[{}[\],:]|[^\s"{}[\],:]+/gs) ?? []
   const isOnOneLine = oneLiners(parts)
@@ -15,6 +17,7 @@ export function indented(text) {
   const line = () => (flat ? '' : `\n${'  '.repeat(Math.min(depth, DEPTH))}`)
   const shown = []
   for (const [index, part] of parts.entries()) {
+    if (shown.length > LINES) return shown.join('') + cut
     if (part === '{' || part === '[') {
       depth += 1
       flat = isOnOneLine.has(index)

@@ -4,25 +4,16 @@
 import { h } from './vendor/preact.mjs'
 import { useEffect, useReducer, useRef, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
+import { useRights as useTopicRights } from './calling.js'
 import { verb } from './link.js'
 
 export const html = htm.bind(h)
 
 /** Of each verb why the user may not call it, '' if it may; null until that is known. */
 export function useRights(verbs) {
-  const [rights, setRights] = useState(null)
-  useEffect(() => {
-    let isGone = false
-    const questions = verbs.map((name) => ({ action: 'publish', topic: `$CONTROL/appliance/v1/${name}/_call` }))
-    verb('rights', { questions }).then(
-      (answer) => Object.fromEntries(answer.rights.map((right, index) => [
-        verbs[index], right.allowed ? '' : right.line ?? right.reason,
-      ])),
-      () => ({}), // then each verb says itself who may not call it
-    ).then((found) => isGone || setRights(found))
-    return () => { isGone = true }
-  }, [])
-  return rights
+  const topicOf = (name) => `$CONTROL/appliance/v1/${name}/_call`
+  const rights = useTopicRights(verbs.map(topicOf))
+  return rights && Object.fromEntries(verbs.map((name) => [name, rights.get(topicOf(name)) ?? '']))
 }
 
 /** What keeps the user from calling a verb: a line of the ACL, or '' if nothing does. */

@@ -1,7 +1,7 @@
 // What an open page keeps of some topics: the newest of each as text, over the connection of what is
 // looked at. Runs in the worker. All is bounded; what is longer is cut, and says so.
 
-import { cut, decode } from './formats.js'
+import { cut, decode, isZstd, size } from './formats.js'
 
 const TOPICS = 1000
 const TEXT = 256 * 1024 // characters of one: the largest schema
@@ -104,9 +104,13 @@ export class Shelf {
 }
 
 /** The text of a message: JSON as it came, other encodings as lines of their values. */
-async function words({ payload, properties, size }) {
+async function words({ payload, properties, size: length }) {
+  // The bridge compresses no calls: to unpack what somebody else sent would only cost.
+  if (isZstd(properties)) return { text: `zstd, ${size(length)}`, isJson: false }
   const { kind, leaves, text } = await decode(payload, properties)
-  if (kind === 'json' && payload.length === size) return { text: cut(new TextDecoder().decode(payload), TEXT), isJson: size <= TEXT }
+  if (kind === 'json' && payload.length === length) {
+    return { text: cut(new TextDecoder().decode(payload), TEXT), isJson: length <= TEXT }
+  }
   const lines = leaves?.map(([path, value]) => (path ? `${path}: ${value}` : value)).join('\n')
   return { text: cut(lines ?? text ?? kind, TEXT), isJson: false }
 }

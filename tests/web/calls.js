@@ -1,0 +1,93 @@
+// node calls.js URL-of-the-console's-files: JSON as text, and what an open page keeps.
+
+import assert from 'node:assert/strict'
+
+const { blank, faultOf, indented, objectText, valueOf } = await import(`${process.argv[2]}/json-text.js`)
+const { Shelf, covers } = await import(`${process.argv[2]}/shelf.js`)
+const bytes = (text) => new TextEncoder().encode(text)
+
+// Digits and texts stay as they are.
+assert.equal(indented('{"a":9007199254740993,"b":[1,2],"c":{},"d":[{"e":"}, \\"["}],"f":[]}'), `{
+  "a": 9007199254740993,
+  "b": [1, 2],
+  "c": {},
+  "d": [
+    {
+      "e": "}, \\"["
+    }
+  ],
+  "f": []
+}`)
+for (const text of ['plain, text', '"a string"', '', '12']) assert.equal(indented(text), text)
+for (const text of ['[', '}}}', '["no end', '{"a":', ']'.repeat(50), '[1,,]']) assert.equal(typeof indented(text), 'string')
+assert.ok(indented('['.repeat(60000) + ']'.repeat(60000)).length < 1e6)
+assert.match(indented(`["${'x'.repeat(3_000_000)}"]`), /cut: 3000004 characters in all$/)
+assert.equal(objectText([['a"b', '9007199254740993'], ['__proto__', '1']]), '{"a\\"b": 9007199254740993, "__proto__": 1}')
+assert.match(faultOf('{"a": tru}'), /^Not JSON/)
+assert.equal(faultOf('[1]'), '')
+assert.equal(valueOf('{'), undefined)
+
+// Defaults by a schema, also by one that is recursive, hostile or none.
+const schema = {
+  properties: { n: { default: 5 }, time: { anyOf: [{ $ref: '#/$defs/a~1b' }, { const: 'now' }] }, some: { type: 'array', minItems: 2, items: { type: 'number' } } },
+  type: 'object',
+  $defs: { 'a/b': { type: 'object', properties: { sec: { type: 'integer' } } } },
+}
+assert.deepEqual(JSON.parse(blank(schema)), { n: 5, time: { sec: 0 }, some: [0, 0] })
+const loop = { type: 'object', properties: { again: { $ref: '#/$defs/loop' } }, $defs: {} }
+loop.$defs.loop = { type: 'array', minItems: 1e9, items: { $ref: '#/$defs/loop' } }
+for (const odd of [loop, null, 1, {}, { $ref: '#/$defs/toString' }, { type: 'object', properties: 7 }, { anyOf: [] }]) JSON.parse(blank(odd))
+
+// What is kept: the newest, of so many topics.
+class Client {
+  constructor() {
+    this.connected = true
+    this.handlers = {}
+    this.subscribed = []
+  }
+
+  on(name, handler) { this.handlers[name] = handler }
+
+  subscribe(filter, options, done) {
+    this.subscribed.push(filter)
+    done(null, [], { granted: [filter.startsWith('no/') ? 0x87 : 0] })
+  }
+
+  unsubscribe(filters) { this.subscribed = this.subscribed.filter((each) => !filters.includes(each)) }
+
+  send(topic, text, properties = { contentType: 'application/json' }) {
+    this.handlers.message(topic, Buffer.from(text), { properties })
+  }
+}
+const client = new Client()
+const shelf = new Shelf(client)
+const told = async () => Object.fromEntries((await shelf.told()).changes)
+client.send('a/b', '1')
+assert.deepEqual(await told(), {})
+shelf.look({ run: 1, wanted: [['a/+', 10], ['no/#', 1]] })
+assert.deepEqual((await shelf.told()).refused, ['no/#'])
+client.send('a/b', '1')
+client.send('a/b', '9007199254740993')
+client.send('a/b/c', '1')
+const { 'a/b': kept, ...others } = await told()
+assert.deepEqual([kept.text, kept.isJson, kept.size, others], ['9007199254740993', true, 16, {}])
+assert.deepEqual(await told(), {})
+client.send('a/b', '')
+assert.deepEqual(await told(), { 'a/b': null })
+client.send('a/cbor', Uint8Array.of(0xa1, 0x61, 0x78, 0x01), { contentType: 'application/cbor' })
+client.send('a/zstd', '1', { userProperties: { 'content-encoding': 'zstd' } })
+const odd = await told()
+assert.deepEqual([odd['a/cbor'].text, odd['a/cbor'].isJson, odd['a/zstd'].text], ['x: 1', false, 'zstd, 1 B'])
+for (let index = 0; index < 5000; index++) client.send(`a/${index}`, '1')
+assert.equal(shelf.topics.size, 1000)
+for (let index = 0; index < 20; index++) client.send(`a/large${index}`, `"${'x'.repeat(1 << 20)}"`)
+assert.ok(shelf.bytes <= 8 << 20)
+assert.equal(shelf.bytes, [...shelf.topics.values()].reduce((sum, { payload }) => sum + payload.length, 0))
+shelf.look({ run: 2, wanted: [] })
+assert.deepEqual([client.subscribed, shelf.topics.size, (await shelf.told()).run], [[], 0, 2])
+shelf.stop()
+
+assert.ok(covers('a/#', 'a/b/c') && covers('a/+', 'a/') && covers('a', 'a'))
+assert.ok(!covers('a/+', 'a') && !covers('a/+', 'a/b/c') && !covers('a', 'b'))
+
+console.log('ok')
