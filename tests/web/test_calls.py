@@ -144,6 +144,7 @@ def test_parameters(visit: Callable[..., Visit], robot: Robot, appliance: Applia
     page.wait_for_selector("text='An integer is wanted.'")
     page.fill(field.format("steps"), "20")
     page.fill(field.format("mode"), "furious")
+    page.evaluate("scrollTo(0, 0)")  # the header covers nothing there
     visited.look("phone-calls-3-parameters")
     page.click("button:text-is('Set 2, all or none')")
     page.wait_for_selector(".notice.bad:has-text('there is no mode furious')")

@@ -59,8 +59,8 @@ function List({ entries, topic }) {
 function Kind({ label, entries, topic }) {
   if (entries.length === 0) return null
   return html`<h2>${label} <span class="quiet">${entries.length}</span></h2>
-    <ul class="tree">${entries.slice(0, SHOWN).map(({ ros, mqtt, type }) => html`<li key=${mqtt}>
+    <ul class="tree">${entries.slice(0, SHOWN).map(({ ros, mqtt, type, direction }) => html`<li key=${mqtt}>
       <a class="row" href=${`#/calls/${encodeURIComponent(mqtt)}`} aria-current=${mqtt === topic ? 'true' : null}>
-        <bdi class="name">${ros}</bdi><span class="value"><bdi>${type}</bdi></span></a></li>`)}
+        <bdi class="name">${ros}</bdi><span class="value"><bdi>${direction === 'parameters' ? '' : type}</bdi></span></a></li>`)}
     ${entries.length > SHOWN && html`<li class="quiet">… ${entries.length - SHOWN} more: search for them</li>`}</ul>`
 }

@@ -41,7 +41,7 @@ export default function Parameters({ entry }) {
   const shown = parameters.slice(0, SHOWN)
   const rights = useRights([`${mqtt}/_set`, ...shown.map(([name]) => `${mqtt}/${name}/set`)])
   const several = lack(rights, `${mqtt}/_set`)
-  const line = (name) => several && lack(rights, `${mqtt}/${name}/set`)
+  const line = (name) => lack(rights, `${mqtt}/${name}/set`) && several
   const lines = shown.map(([name]) => line(name)).filter(Boolean)
   const changed = [...drafts]
   const wrong = changed.find(([, { type, text }]) => fault(type, text))
