@@ -151,6 +151,15 @@ def test_the_libraries_are_those_of_npm():
             assert (VENDOR / here).read_bytes() == original.read_bytes(), here
 
 
+@pytest.mark.parametrize("name", OWN)
+def test_a_module_has_no_error_of_syntax(name: str):
+    """Before a browser is started: a page whose modules do not load says nothing."""
+    with (FILES / name).open() as module:
+        command = ["node", "--input-type=module", "--check", "-"]
+        done = subprocess.run(command, stdin=module, capture_output=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr.decode()
+
+
 @pytest.mark.parametrize("name", ["formats", "camera", "map", "calls"])
 def test_hostile_payloads(name: str):
     """What reads payloads, in node: exact, bounded, and no key becomes one of an object."""

@@ -3,7 +3,7 @@
 import { h } from './vendor/preact.mjs'
 import { useEffect, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
-import { keep, shelf, verb } from './link.js'
+import { shelf, shelve, verb } from './link.js'
 import { blank, faultOf, indented, valueOf } from './json-text.js'
 
 export const html = htm.bind(h)
@@ -15,12 +15,12 @@ const RESERVE = 2 // seconds until the appliance's own answer, that time is over
 /** Keep topics while a page is open and can be seen: pairs of a filter and messages a second. */
 export function useShelf(wanted) {
   useEffect(() => {
-    const change = () => keep(document.hidden ? [] : wanted)
+    const change = () => shelve(document.hidden ? [] : wanted)
     change()
     document.addEventListener('visibilitychange', change)
     return () => {
       document.removeEventListener('visibilitychange', change)
-      keep([])
+      shelve([])
     }
   }, [JSON.stringify(wanted)])
   return shelf.value

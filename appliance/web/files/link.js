@@ -88,7 +88,7 @@ function take(told) {
     if (!isPaused.peek()) takeRows(told.rows)
     else held.push(...told.rows.slice(0, 1000))
     if (held.length > 5000) held.splice(0, held.length - 5000)
-    if (told.shelf?.run === keeping) takeShelf(told.shelf)
+    if (told.shelf?.run === shelving) takeShelf(told.shelf)
     if (told.focus) {
       inspected.peek()?.bitmap?.close()
       inspected.value = told.focus
@@ -132,13 +132,13 @@ export function focus(topic) {
   tell('focus', { topic })
 }
 
-let keeping = 0
+let shelving = 0
 
 /** Keep the newest of these in `shelf`: pairs of a filter and messages a second. */
-export function keep(wanted) {
-  keeping += 1
+export function shelve(wanted) {
+  shelving += 1
   shelf.value = { topics: new Map(), refused: [] }
-  tell('keep', { run: keeping, wanted })
+  tell('shelve', { run: shelving, wanted })
 }
 
 function takeShelf({ changes, refused }) {

@@ -22,7 +22,7 @@ let survey = null
 let focus = null
 let drive = null
 let shelf = null
-let keeping = { run: 0, wanted: [] } // what the open page wants kept
+let shelved = { run: 0, wanted: [] } // what the open page wants kept
 let desk = null // the connection for calls, once somebody calls
 let state = { name: 'out', reason: '' }
 let topics = new Map()
@@ -115,7 +115,7 @@ function signIn({ url, user, password, token }) {
     focus ??= new Focus(() => open({}, FOCUS_PACKET), takeAbout)
     if (shelf === null) {
       shelf = new Shelf(focus.client)
-      shelf.look(keeping)
+      shelf.look(shelved)
     }
     drive ??= new Drive((more) => open(more, SURVEY_PACKET))
     drive.again()
@@ -291,8 +291,8 @@ const calls = {
   watch,
   unwatch,
   next: () => viewer?.next(),
-  keep: (values) => {
-    keeping = values
+  shelve: (values) => {
+    shelved = values
     shelf?.look(values)
   },
   request: async (values) => (await calling()).request(values),
