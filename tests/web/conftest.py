@@ -1,6 +1,7 @@
 """For journeys: an appliance with the console and the demo robot, and a real Chromium.
 
-A file of journeys has its own; it may have fixtures `bridge`, with its own bridge, and `web_port`.
+A file of journeys has its own; it may have fixtures `bridge` and `acl`, with its own bridge and
+access rules, and `web_port`.
 """
 
 from __future__ import annotations
@@ -69,8 +70,14 @@ def web_port() -> int:
 
 
 @pytest.fixture(scope="module")
+def acl() -> str:
+    """The access rules."""
+    return ACL
+
+
+@pytest.fixture(scope="module")
 def appliance(
-    tmp_path_factory: pytest.TempPathFactory, bridge: dict[str, Any], web_port: int
+    tmp_path_factory: pytest.TempPathFactory, bridge: dict[str, Any], acl: str, web_port: int
 ) -> Iterator[ApplianceProcess]:
     bind = "127.0.0.1:0"
     web = {"bind": bind, "protocol": "web"}
@@ -79,7 +86,7 @@ def appliance(
     process = ApplianceProcess(
         tmp_path_factory.mktemp("console"),
         users={"viewer": PASSWORD},
-        acl=ACL,
+        acl=acl,
         broker={"listeners": listeners},
         bridge=bridge,
     )

@@ -1,9 +1,9 @@
-// node schema.js URL-of-exact.js URL-of-schema.js: exact numbers, hostile texts and hostile schemas.
+// node schema.js URL-of-the-console's-files: exact numbers, hostile texts and hostile schemas.
 
 import assert from 'node:assert/strict'
 
-const { Num, parse, print } = await import(process.argv[2])
-const { check, describe, initial, schemaOf } = await import(process.argv[3])
+const { parse, print } = await import(`${process.argv[2]}/exact.js`)
+const { check, constantsOf, describe, initial, schemaOf } = await import(`${process.argv[2]}/schema.js`)
 
 // What is read is written again, digit by digit; no key is special.
 for (const text of ['9007199254740993', '-0', '1.10', '1e400', '"\\u0000é\\n"', '[]', '{}', 'null', '[1, 2]', '18446744073709551615']) {
@@ -64,6 +64,11 @@ assert.equal(field('small').preset.text, '7')
 assert.equal(field('stamp').kind, 'object')
 assert.ok(field('stamp').isTime)
 assert.equal(print(initial(root, root.get('properties').get('fixed'))), '[0, 0, 0]')
+
+const named = schemaOf('{"type": "object", "properties": {"mode": {"type": "integer"}}, "x-constants": {"MODE_ON": 1, "MODELESS": 2, "MODE_BAD": {}, "X": 9007199254740993}}')
+assert.deepEqual(constantsOf(describe(named, named), 'mode'), [['MODE_ON', '1']])
+const badly = schemaOf('{"type": "object", "properties": {}, "x-constants": 5}')
+assert.deepEqual(constantsOf(describe(badly, badly), 'mode'), [])
 
 // Schemas that are none: no exception, no endless loop, nothing large.
 assert.equal(schemaOf('{'), null)

@@ -2,7 +2,7 @@
 // of a stranger's is special. What is too deep or too much is refused before it costs.
 
 const DEPTH = 64
-const VALUES = 20000
+const VALUES = 20000 // in a message; a form of more would be slow
 
 /** A number as it was written: 2^53 + 1 is none of JavaScript's. */
 export class Num {
@@ -16,16 +16,16 @@ const NUMBER = /-?(?:0|[1-9]\d*)(?:\.\d+)?(?:[eE][+-]?\d+)?/y
 const SPACE = /[ \t\r\n]*/y
 const WORDS = [['true', true], ['false', false], ['null', null]]
 
-/** The value of a JSON text. Throws SyntaxError, which says where. */
-export function parse(text) {
-  return new Parser(text).whole()
+/** The value of a JSON text of at most so many values. Throws SyntaxError, which says where. */
+export function parse(text, most = VALUES) {
+  return new Parser(text, most).whole()
 }
 
 class Parser {
-  constructor(text) {
+  constructor(text, most) {
     this.text = text
     this.at = 0
-    this.left = VALUES
+    this.most = this.left = most
   }
 
   whole() {
@@ -55,7 +55,7 @@ class Parser {
 
   value(depth) {
     this.left -= 1
-    if (this.left < 0) this.fail(`more than ${VALUES} values`)
+    if (this.left < 0) this.fail(`more than ${this.most} values`)
     if (depth > DEPTH) this.fail(`nested deeper than ${DEPTH} levels`)
     const first = this.next()
     if (first === '{') return this.object(depth)

@@ -11,6 +11,8 @@ const html = htm.bind(h)
 const PAGES = [
   ['overview', 'Overview'],
   ['topics', 'Topics'],
+  ['publish', 'Publish'],
+  ['routes', 'Routes'],
   ['drive', 'Drive'],
   ['calls', 'Calls'],
   ['camera', 'Camera'],
@@ -20,7 +22,10 @@ const PAGES = [
   ['health', 'Health'],
 ]
 const LOADERS = {
+  bridged: () => import('./bridged.js'), // of the overview
   topics: () => import('./topics.js'),
+  publish: () => import('./publish.js'),
+  routes: () => import('./routes.js'),
   drive: () => import('./drive.js'),
   calls: () => import('./calls.js'),
   camera: () => import('./camera.js'),
@@ -200,8 +205,7 @@ function Overview() {
         <dd class=${state === 'not ready' ? 'bad' : ''}>${state}</dd></div>`)}
       ${FIGURES.map(([name, label]) => html`<${Figure} key=${name} name=${name} label=${label} />`)}
     </dl></section>
-    ${[...robots.value].map(([robot, { routes = [] }]) => html`<${Bridge} key=${robot}
-      robot=${robot} routes=${routes} />`)}`
+    <${Later} page="bridged" />`
 }
 
 function Figure({ name, label }) {
@@ -213,26 +217,12 @@ function Figure({ name, label }) {
 function warningsOf(robot, { routes = [], skipped }) {
   const found = []
   for (const route of routes) {
-    if (!route || typeof route !== 'object') continue
-    const lost = ['errors', 'lost', 'dropped'].filter((name) => route[name] > 0)
+    const lost = ['errors', 'lost', 'dropped'].filter((name) => Number.isFinite(route[name]) && route[name] > 0)
     const counts = lost.map((name) => `${route[name]} ${name}`).join(', ')
-    if (counts) found.push([String(route.ros), `${counts}${route.last_error ? `: ${route.last_error}` : ''}`])
+    if (counts) found.push([route.ros, [counts, route.last_error].filter((part) => typeof part === 'string').join(': ')])
   }
-  if (skipped?.count > 0) found.push([robot, `${skipped.count} not bridged`])
+  if (Number.isFinite(skipped?.count) && skipped.count > 0) found.push([robot, `${skipped.count} not bridged`])
   return found
-}
-
-function Bridge({ robot, routes }) {
-  const carried = routes.filter((route) => typeof route?.mqtt === 'string' && route.direction)
-  return html`<section><h2>Bridged topics of <bdi>${robot}</bdi></h2>
-    <div class="scroll" tabindex="0" role="region" aria-label="Bridged topics"><table>
-    <thead><tr><th>ROS</th><th>MQTT</th><th class="number">Hz</th><th class="number">bytes</th></tr></thead>
-    <tbody>${carried.slice(0, 200).map((route) => html`<tr key=${route.direction + route.mqtt}>
-      <td><bdi>${route.ros}</bdi></td>
-      <td>${route.direction === 'to_ros' ? '←' : '→'} <a href=${`#/topics/${encodeURIComponent(route.mqtt)}`}>
-        <bdi>${route.mqtt}</bdi></a></td>
-      <td class="number">${route.rate}</td><td class="number">${route.size}</td></tr>`)}</tbody>
-  </table></div></section>`
 }
 
 resume()

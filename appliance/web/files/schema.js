@@ -5,13 +5,15 @@ import { Num, parse, print } from './exact.js'
 
 const HOPS = 16 // references one after the other
 const ERRORS = 100
+const CONSTANTS = 200 // of a field
+const LARGEST = 100000 // values of a schema
 const NESTED = 16 // levels that are filled in
 const FILLED = 1000 // items that are filled in, in all
 
 /** The schema of a text; null where it is none. */
 export function schemaOf(text) {
   try {
-    const found = parse(text)
+    const found = parse(text, LARGEST)
     return found instanceof Map ? found : null
   } catch {
     return null
@@ -20,7 +22,7 @@ export function schemaOf(text) {
 
 /**
  * What a part of the schema takes: its `kind`, and by that what belongs to it.
- * object: fields (Map of name → part); array: item, least, most; octets: least, most;
+ * object: fields (Map of name → part), constants (Map of name → value); array: item, least, most; octets: least, most;
  * integer: low, high (BigInt or null); string: most; choice: values; and number, boolean, any.
  * `isTime` says that "now" is taken too, `preset` is the default, undefined without one.
  */
@@ -58,7 +60,8 @@ function plain(part) {
   const type = [part.get('type')].flat().find((name) => name !== 'null')
   if (type === 'object') {
     const fields = part.get('properties')
-    return fields instanceof Map ? { kind: 'object', fields } : { kind: 'any' }
+    const constants = part.get('x-constants')
+    return fields instanceof Map ? { kind: 'object', fields, constants: constants instanceof Map ? constants : new Map() } : { kind: 'any' }
   }
   if (type === 'array') return { kind: 'array', item: part.get('items'), ...bounds(part) }
   if (type === 'integer') return { kind: 'integer', low: integerOf(part.get('minimum')), high: integerOf(part.get('maximum')) }
@@ -91,6 +94,13 @@ function bounds(part) {
 function countOf(value) {
   const found = value instanceof Num ? Number(value.text) : NaN
   return Number.isSafeInteger(found) && found >= 0 ? found : null
+}
+
+/** The constants that are meant for a field, as ROS's types name them: [name, text] each. */
+export function constantsOf({ constants }, field) {
+  const beginning = `${field}_`.toUpperCase()
+  const found = [...constants].filter(([name, value]) => name.startsWith(beginning) && (value instanceof Num || typeof value === 'string'))
+  return found.slice(0, CONSTANTS).map(([name, value]) => [name, value instanceof Num ? value.text : value])
 }
 
 /** The integer of a number's text, null where it is none or has too many digits for any. */

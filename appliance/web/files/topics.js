@@ -119,6 +119,7 @@ function Inspector({ topic }) {
   const keep = async () => save(await ask('export'), `${topic}.jsonl`)
   return html`<section class="inspector" aria-labelledby="inspected">
     <div class="tools"><h2 id="inspected"><bdi>${shown(topic)}</bdi></h2>
+      <a class="button" href=${`#/publish/${encodeURIComponent(topic)}`}>Publish</a>
       <a class="button" href="#/topics">Close</a></div>
     ${told?.reason && html`<p class="notice bad" role="alert">${told.reason}</p>`}
     ${message === null ? html`<p class="quiet">Nothing has come yet.</p>` : html`

@@ -223,10 +223,16 @@ function takeAbout(topic, buffer) {
     if (what !== 'routes' && what !== 'skipped' && what !== 'state') return
     const text = new TextDecoder().decode(buffer)
     const value = what === 'state' ? text : JSON.parse(text)
-    about.set(`${topic.slice(0, topic.indexOf('/'))} ${what}`, value)
+    const said = what === 'routes' ? value.filter(isRoute) : value
+    about.set(`${topic.slice(0, topic.indexOf('/'))} ${what}`, said)
   } catch {
     // Not ours then: what the appliance publishes is JSON.
   }
+}
+
+/** Whether an entry has what all routes have: who may write `other/_appliance/routes` may say anything there. */
+function isRoute(entry) {
+  return entry !== null && ['ros', 'mqtt', 'type', 'direction'].every((name) => typeof entry[name] === 'string')
 }
 
 /** Rates once a second; a topic whose rate has changed is told again. */
