@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cbor2
@@ -56,6 +57,23 @@ def rates(appliance: ApplianceProcess, topic: str) -> list[float]:
 def pixels(page: Any) -> str:
     """What the canvas shows."""
     return str(page.evaluate("document.querySelector('canvas').toDataURL()"))
+
+
+def wait_for_other_pixels(page: Any, act: Callable[[], Any]) -> None:
+    before = pixels(page)
+    act()
+    eventually(lambda: pixels(page) != before, f"the canvas changes after {act}")
+
+
+def two_fingers(page: Any) -> None:
+    """Put two fingers on the canvas, and move them apart."""
+    box = page.locator("canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    touch = page.context.new_cdp_session(page)
+    for apart, kind in ((20, "touchStart"), (60, "touchMove"), (100, "touchMove"), (0, "touchEnd")):
+        points = [{"x": x - apart, "y": y, "id": 0}, {"x": x + apart, "y": y, "id": 1}]
+        event = {"type": kind, "touchPoints": points if apart else []}
+        touch.send("Input.dispatchTouchEvent", event)
 
 
 def show_as(page: Any, *, hidden: bool) -> None:
@@ -143,13 +161,14 @@ def test_a_map(
     page.wait_for_selector("dd:text-is('0.00, 0.00 m')")
     assert page.locator(".notice").count() == 0
     visited.look(f"{kind}-map")
-    first = pixels(page)
-    page.click("button[aria-label=Enlarge]")
-    eventually(lambda: pixels(page) != first, "it is larger")
-    page.focus("canvas")
-    for key in ("0", "ArrowLeft", "+", "-", "ArrowDown"):
-        page.keyboard.press(key)
-    page.mouse.wheel(0, -300)
+    pinch = partial(two_fingers, page)
+    drag = partial(page.drag_and_drop, "canvas", "h1", source_position={"x": 90, "y": 90})
+    actions: list[Callable[[], Any]] = [drag, partial(page.mouse.wheel, 0, -300), pinch]
+    actions += [partial(page.press, "canvas", key) for key in ("ArrowLeft", "+", "0", "-")]
+    actions += [partial(page.click, f"text='{name}'") for name in ("Follow", "+", "Show all")]
+    page.hover("canvas")
+    for act in actions:
+        wait_for_other_pixels(page, act)
     visited.look(f"{kind}-map-moved")
     show_as(page, hidden=True)
     eventually(lambda: rates(appliance, f"{ROBOT}/odom") == [], "the subscriptions end")

@@ -88,7 +88,7 @@ function Pictures({ topic, isPossible }) {
   const age = last === null ? null : (Date.now() - last.at) / 1000
   const silence = (Date.now() - Math.max(last?.at ?? 0, began)) / 1000
   const isOld = isOn && silence > Math.max(OLD, 5 / rate.value)
-  const save = () => canvas.current.toBlob((blob) => download(blob, topic))
+  const save = () => canvas.current.toBlob((blob) => blob && download(blob, topic))
   return html`
     ${reason && html`<p class="notice bad" role="alert">${reason}</p>`}
     ${problem && html`<p class="notice bad" role="alert">The last picture could not be shown: ${problem}</p>`}

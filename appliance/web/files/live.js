@@ -24,16 +24,18 @@ export function useWatch(values, take) {
         await new Promise(requestAnimationFrame) // more than can be drawn is not asked for
       }
     }
+    // The file of a viewer may be gone after an upgrade.
+    const failed = (error) => take({ reason: `This page does not work: ${error.message}. Reload it.`, parts: {} })
     const end = () => {
       run += 1
       tell('unwatch')
     }
     const change = () => {
       end()
-      if (!document.hidden) begin().catch(() => {})
+      if (!document.hidden) begin().catch(failed)
     }
     document.addEventListener('visibilitychange', change)
-    if (!document.hidden) begin().catch(() => {})
+    if (!document.hidden) begin().catch(failed)
     return () => {
       document.removeEventListener('visibilitychange', change)
       end()

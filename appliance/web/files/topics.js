@@ -127,6 +127,7 @@ function Inspector({ topic }) {
         <button aria-pressed=${isPaused.value} onClick=${() => pause(!isPaused.value)}>
           ${isPaused.value ? 'Continue' : 'Pause'}</button>
         <button onClick=${keep}>Export ${told.kept} messages</button>
+        ${message.kind === 'image' && html`<a class="button" href=${`#/camera/${encodeURIComponent(topic)}`}>Camera</a>`}
       </div>
       <dl class="properties">
         <div><dt>received</dt><dd>${clock(message.at)}</dd></div>

@@ -2,6 +2,8 @@
 
 export const PACKET = 17 * 1024 * 1024 // a picture has at most 16 MiB
 
+const REFUSED = new Set([0x86, 0x87, 0x8a]) // bad user name or password, not authorized, banned
+
 export class Watch {
   /** Each of `wanted` is [topic, messages a second]; `take` gets each message, `tell` what changed. */
   constructor(open, wanted, take, tell) {
@@ -29,7 +31,7 @@ export class Watch {
       if (!this.isOver) take(topic, new Uint8Array(buffer), packet.properties ?? {}, Date.now())
     })
     client.on('error', (error) => {
-      if (typeof error.code !== 'number' || error.code < 0x80) return
+      if (!REFUSED.has(error.code)) return
       say(`The login was refused: ${error.message}`)
       client.end(true) // asking again and again would only count as wrong passwords
     })
