@@ -161,14 +161,15 @@ def test_a_map(
     page.wait_for_selector("dd:text-is('0.00, 0.00 m')")
     assert page.locator(".notice").count() == 0
     visited.look(f"{kind}-map")
-    pinch = partial(two_fingers, page)
-    drag = partial(page.drag_and_drop, "canvas", "h1", source_position={"x": 90, "y": 90})
-    actions: list[Callable[[], Any]] = [drag, partial(page.mouse.wheel, 0, -300), pinch]
-    actions += [partial(page.press, "canvas", key) for key in ("ArrowLeft", "+", "0", "-")]
-    actions += [partial(page.click, f"text='{name}'") for name in ("Follow", "+", "Show all")]
     page.hover("canvas")
-    for act in actions:
-        wait_for_other_pixels(page, act)
+    wait_for_other_pixels(page, lambda: page.mouse.wheel(0, -300))
+    drag = {"source_position": {"x": 90, "y": 90}, "target_position": {"x": 120, "y": 50}}
+    wait_for_other_pixels(page, lambda: page.drag_and_drop("canvas", "canvas", **drag))
+    wait_for_other_pixels(page, lambda: two_fingers(page))
+    for name in ("Follow", "+", "Show all"):
+        wait_for_other_pixels(page, partial(page.click, f"button:text-is('{name}')"))
+    for key in ("ArrowLeft", "+", "0"):
+        wait_for_other_pixels(page, partial(page.press, "canvas", key))
     visited.look(f"{kind}-map-moved")
     show_as(page, hidden=True)
     eventually(lambda: rates(appliance, f"{ROBOT}/odom") == [], "the subscriptions end")

@@ -6,6 +6,7 @@ import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
 import { robots } from './link.js'
 import { routesOf, useWatch } from './live.js'
+import { save } from './save.js'
 
 const html = htm.bind(h)
 
@@ -88,7 +89,7 @@ function Pictures({ topic, isPossible }) {
   const age = last === null ? null : (Date.now() - last.at) / 1000
   const silence = (Date.now() - Math.max(last?.at ?? 0, began)) / 1000
   const isOld = isOn && silence > Math.max(OLD, 5 / rate.value)
-  const save = () => canvas.current.toBlob((blob) => blob && download(blob, topic))
+  const keep = () => canvas.current.toBlob((blob) => blob && save(blob, `${topic}.png`))
   return html`
     ${reason && html`<p class="notice bad" role="alert">${reason}</p>`}
     ${problem && html`<p class="notice bad" role="alert">The last picture could not be shown: ${problem}</p>`}
@@ -97,7 +98,7 @@ function Pictures({ topic, isPossible }) {
     <div class="tools">
       <button aria-pressed=${isPaused} disabled=${!isPossible} onClick=${() => pause(!isPaused)}>
         ${isPaused ? 'Continue' : 'Pause'}</button>
-      <button disabled=${last === null} onClick=${save}>Save the picture</button>
+      <button disabled=${last === null} onClick=${keep}>Save the picture</button>
     </div>
     <canvas class=${`video ${isOld || isPaused ? 'old' : ''}`} ref=${canvas} width="640" height="360" role="img"
       aria-label=${`Picture of ${topic}`} />
@@ -124,12 +125,4 @@ function rateOf(frames) {
   const recent = frames.filter((at) => at > performance.now() - 3000)
   if (recent.length < 2) return 'less than 1'
   return ((recent.length - 1) * 1000 / (recent.at(-1) - recent[0])).toFixed(1)
-}
-
-function download(blob, topic) {
-  const link = document.createElement('a')
-  link.href = URL.createObjectURL(blob)
-  link.download = `${topic.replace(/[^\w.-]+/g, '_').slice(0, 80)}.png`
-  link.click()
-  setTimeout(() => URL.revokeObjectURL(link.href), 10000)
 }
