@@ -162,7 +162,7 @@ def test_a_module_has_no_error_of_syntax(name: str):
     assert done.returncode == 0, done.stderr.decode()
 
 
-@pytest.mark.parametrize("name", ["formats", "camera", "map", "calls", "schema"])
+@pytest.mark.parametrize("name", ["bounds", "formats", "camera", "map", "calls", "schema"])
 def test_hostile_payloads(name: str):
     """What reads payloads, in node: exact, bounded, and no key becomes one of an object."""
     install()

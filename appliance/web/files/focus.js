@@ -4,7 +4,7 @@ import { cut, decode, hexOf, preview } from './formats.js'
 
 const FOCUS_RATE = '30'
 const HISTORY = 200 // messages
-const HISTORY_BYTES = 16 * 1024 * 1024
+const HISTORY_BYTES = 16 * 1024 * 1024 // of them, with their properties
 const POINTS = 3000
 const SMALL = 64 * 1024 // bytes of a message of which every one is plotted
 
@@ -32,7 +32,6 @@ export class Focus {
     this.path = null
     this.points = []
     this.shown = null
-    this.told_ = null
     this.paused = false
     this.isNew = true
     this.reason = ''
@@ -62,8 +61,8 @@ export class Focus {
     this.topic = topic || null
     if (this.topic === null) return
     if (known) {
-      const { payload, properties, qos, retain, at } = known
-      this.take(payload, { properties, qos, retain, topic }, at)
+      const { payload, properties, qos, retain, at, held } = known
+      this.take(payload, { properties, qos, retain, length: held }, at)
     }
     if (this.client.connected) this.subscribe()
   }
@@ -73,6 +72,7 @@ export class Focus {
     const entry = {
       number: ++this.number,
       payload,
+      size: packet.length ?? payload.length, // of all that the packet says
       at,
       qos: packet.qos,
       retain: packet.retain,
@@ -82,12 +82,12 @@ export class Focus {
     // The survey's copy, once more: retained messages come again with the subscription.
     if (packet.retain && last && this.history.length === 1 && same(last.payload, payload)) {
       this.history.pop()
-      this.bytes -= payload.length
+      this.bytes -= last.size
     }
     this.history.push(entry)
-    this.bytes += payload.length
+    this.bytes += entry.size
     while (this.history.length > 1 && (this.history.length > HISTORY || this.bytes > HISTORY_BYTES)) {
-      this.bytes -= this.history.shift().payload.length
+      this.bytes -= this.history.shift().size
     }
     this.isNew = true
     if (this.path !== null && payload.length <= SMALL) this.point(entry)

@@ -1,18 +1,15 @@
-// The connections, away from the page: it keeps the newest of each topic, and hands the page what
-// has changed when the page asks, once a frame. The password is in this memory only. A token stands
-// for it at each login but the first, and the page keeps that for when it is loaded again.
+// The connections, away from the page, which is handed what has changed when it asks, once a frame.
+// The password is in this memory only. A token stands for it at each login but the first, and the
+// page keeps that for when it is loaded again.
 
 import mqtt from './vendor/mqtt.esm.js'
 import { Drive } from './drive-link.js'
 import { Focus } from './focus.js'
+import { Newest } from './newest.js'
 import { Shelf } from './shelf.js'
-import { cut, preview } from './formats.js'
 
-const TOPICS = 20000 // that are kept; of more the number is told
-const KEPT = 32 * 1024 * 1024 // bytes of payloads that are kept whole
 const SURVEY_PACKET = 32 * 1024
 const FOCUS_PACKET = 12 * 1024 * 1024
-const CHANGES = 500 // topics in one answer to the page
 const MAX_RATE = '2' // messages a second of each topic in the survey
 const TOKEN = 'appliance-token-' // what each begins with
 const WRONG = [0x86, 0x87] // reason codes of a login that is not accepted
@@ -25,10 +22,7 @@ let shelf = null
 let shelved = { run: 0, wanted: [] } // what the open page wants kept
 let desk = null // the connection for calls, once somebody calls
 let state = { name: 'out', reason: '' }
-let topics = new Map()
-let changed = new Set()
-let kept = 0
-let untold = 0
+let newest = new Newest()
 let about = new Map() // what the appliance says about itself
 
 function options(more, packet) {
@@ -121,7 +115,7 @@ function signIn({ url, user, password, token }) {
     drive.again()
     if (client === survey && !login.token) stay()
   })
-  client.on('message', take)
+  client.on('message', (topic, buffer, packet) => newest.take(topic, buffer, packet))
   client.on('error', (error) => {
     if (client !== survey) return
     const code = error.code
@@ -152,10 +146,8 @@ function signOut() {
   desk?.stop()
   survey?.end(true)
   survey = focus = drive = shelf = desk = login = null
-  topics = new Map()
-  changed = new Set()
+  newest = new Newest()
   about = new Map()
-  kept = untold = 0
   state = { name: 'out', reason: '' }
 }
 
@@ -192,30 +184,6 @@ function unwatch() {
 
 // -------------------------------------------------------------------------------------------------
 
-function take(topic, buffer, packet) {
-  let entry = topics.get(topic)
-  if (entry === undefined) {
-    if (topics.size >= TOPICS) {
-      untold += 1
-      return
-    }
-    entry = { count: 0, before: 0, rate: 0, payload: new Uint8Array(0) }
-    topics.set(topic, entry)
-  }
-  kept -= entry.payload.length
-  const isRoom = kept + buffer.length <= KEPT
-  // A copy: the buffer is a view of all that has come with it.
-  entry.payload = Uint8Array.from(isRoom ? buffer : buffer.subarray(0, 256))
-  entry.size = buffer.length
-  kept += entry.payload.length
-  entry.properties = packet.properties ?? {}
-  entry.retain = packet.retain
-  entry.qos = packet.qos
-  entry.at = Date.now()
-  entry.count += 1
-  changed.add(topic)
-}
-
 function takeAbout(topic, buffer) {
   try {
     if (buffer.length > 4 * 1024 * 1024) return
@@ -235,31 +203,10 @@ function isRoute(entry) {
   return entry !== null && ['ros', 'mqtt', 'type', 'direction'].every((name) => typeof entry[name] === 'string')
 }
 
-/** Rates once a second; a topic whose rate has changed is told again. */
-setInterval(() => {
-  for (const [topic, entry] of topics) {
-    if (entry.count < 2) {
-      entry.before = entry.count
-      continue // what comes once has no rate
-    }
-    const now = entry.count - entry.before
-    entry.before = entry.count
-    if (now === 0 && entry.rate === 0) continue
-    const rate = now === 0 && entry.rate < 0.05 ? 0 : 0.7 * entry.rate + 0.3 * now
-    if (rate.toFixed(1) !== entry.rate.toFixed(1)) changed.add(topic)
-    entry.rate = rate
-  }
-}, 1000)
+setInterval(() => newest.measure(), 1000)
 
 async function frame() {
-  const rows = []
-  for (const topic of changed) {
-    if (rows.length >= CHANGES) break
-    changed.delete(topic)
-    const { payload, properties, size, rate, at, retain } = topics.get(topic)
-    rows.push([topic, cut(preview(payload, properties), 200), size, rate, at, retain])
-  }
-  const told = { state, rows, total: topics.size, untold, token: login?.token ?? null }
+  const told = { state, rows: newest.rows(), untold: newest.untold, token: login?.token ?? null }
   if (about.size) {
     told.about = [...about]
     about.clear()
@@ -282,10 +229,7 @@ const calls = {
   signIn,
   signOut: leave,
   frame,
-  focus: ({ topic }) => {
-    const known = topics.get(topic)
-    focus?.look(topic, known && known.payload.length === known.size ? known : null)
-  },
+  focus: ({ topic }) => focus?.look(topic, newest.whole(topic)),
   plot: ({ path }) => focus?.plot(path),
   show: ({ index }) => focus?.show(index),
   pause: ({ paused }) => focus?.pause(paused),

@@ -1,0 +1,39 @@
+// node bounds.js URL-of-the-console's-files: what the worker keeps is bounded, whatever comes.
+
+import assert from 'node:assert/strict'
+
+const { Newest } = await import(`${process.argv[2]}/newest.js`)
+const { Focus } = await import(`${process.argv[2]}/focus.js`)
+const KIB = 1024
+
+/** A message of which most bytes are its properties. */
+function packet(size) {
+  return { length: size, qos: 0, retain: false, properties: { userProperties: { a: 'x' } } }
+}
+
+// Names and properties count as payloads do.
+let newest = new Newest()
+const payload = new Uint8Array(10)
+for (let n = 0; n < 2000; n += 1) newest.take(`t/${n}`, payload, packet(32 * KIB))
+assert.ok(newest.kept <= 32 * KIB * KIB && newest.topics.size === 2000, `${newest.kept} bytes`)
+assert.ok(newest.whole('t/0') && !newest.whole('t/1999'))
+assert.deepEqual(newest.topics.get('t/1999').properties, {})
+for (let n = 0; n < 2000; n += 1) newest.take(`t/${n}`, payload, packet(20))
+assert.equal(newest.kept, 2000 * 20)
+assert.ok(newest.whole('t/1999'))
+newest = new Newest()
+for (let n = 0; n < 2000; n += 1) newest.take(`${'n'.repeat(30 * KIB)}/${n}`, payload, packet(30 * KIB))
+assert.ok(newest.names <= 16 * KIB * KIB && newest.kept <= 32 * KIB * KIB && newest.untold > 0)
+
+// Rows are told once, and no more than fit an answer.
+newest = new Newest()
+for (let n = 0; n < 600; n += 1) newest.take(`t/${n}`, payload, packet(20))
+assert.deepEqual([newest.rows().length, newest.rows().length, newest.rows().length], [500, 100, 0])
+
+// The history of the topic that is looked at.
+const client = { connected: false, on() {}, end() {} }
+const focus = new Focus(() => client, () => {})
+focus.look('t', null)
+for (let n = 0; n < 100; n += 1) focus.take(payload, packet(1024 * KIB), n)
+assert.ok(focus.bytes <= 16 * KIB * KIB && focus.history.length === 16, `${focus.history.length}`)
+console.log('ok')
