@@ -42,8 +42,6 @@ NOT_RUN = {
     "make test": "runs all tests, of which this is one",
     ".venv/bin/python -m pytest tests/broker -q -x": "runs tests, which `make test` does as well",
     "make compiled": "compiles for minutes; tests/packaging/test_compiled.py does the same",
-    "curl --cacert ~/appliance/certs/ca.crt https://robot.local:8443/readyz": "needs a listener for"
-    " the web; tests/app/test_web.py asks the same",
     "appliance clients kick tablet --user alice --host robot.local --ca ca.crt": "needs another"
     " client; tests/cli/test_clients.py disconnects one",
     "make binary": "builds for minutes; tests/packaging/test_binary.py runs what it builds",
@@ -64,6 +62,8 @@ STAND_INS = (
     ("sudo appliance ", "single-file "),
     ("appliance bench", "short-bench bench"),
     ("//broker.example", "//127.0.0.1:1"),  # nobody listens there
+    ("https://robot.local:8443", "https://localhost:{web_port}"),
+    ("-u operator ", "-u {user}:{password} "),
     ("--host robot.local", "--host localhost --port {port}"),
     (" … ", " -h localhost -p {port} --cafile certs/ca.crt -u {user} -P {password} "),
     # ROS's packages on PyPI have no navigation: the action is a Fibonacci.
@@ -72,6 +72,7 @@ STAND_INS = (
 
 #: Options that a line gets beside its own: most so that it ends by itself, and soon.
 ADDED = (
+    (r"^curl ", "-sS --fail-with-body --retry 10 --retry-all-errors"),  # until all is ready
     (r"appliance sub |mosquitto_sub ", "-C 1 -W 30"),
     (r"appliance user (add|passwd) (?!.*--generate)", "--generate"),  # there is no terminal to ask
     (r"short-bench (?!.*growth)", "--seconds 0.2"),
@@ -100,6 +101,7 @@ command.GROWTH = tuple(
 NEED_RUNNING = re.compile(
     r"appliance (status|top|reload|routes|clients|upstream|doctor|pub|sub|call|goal|param) "
     r"|mosquitto_"
+    r"|curl "
 )
 NEED_STOPPED = re.compile(r"appliance (run|store) |make run ")
 #: They run until they are stopped.
@@ -130,7 +132,9 @@ BRIDGE = """\
 CONFIGURATION = """\
 robot: r2d2
 broker:
-  listeners: [{{bind: "127.0.0.1:${{APPLIANCE_PORT}}", tls: true}}]
+  listeners:
+    - {{bind: "127.0.0.1:${{APPLIANCE_PORT}}", tls: true}}
+    - {{bind: "127.0.0.1:${{WEB_PORT}}", tls: true, protocol: web}}
 bridge:
   bus: {bus}
 """
@@ -168,7 +172,7 @@ class Site:
         self.home = folder / "home"
         self.folder = self.home / "appliance"
         self.clone = self.home / "clone"
-        self.port, plain_port, web_port = free_ports(3)
+        self.port, plain_port, self.web_port = free_ports(3)
         self.user = USER.get(page.name, "operator")
         self.password = ""
         self.log = folder / "log"
@@ -190,7 +194,7 @@ class Site:
             "DESTDIR": str(image),
             "PORT": str(self.port),  # of `make run`
             "PLAIN_PORT": str(plain_port),
-            "WEB_PORT": str(web_port),
+            "WEB_PORT": str(self.web_port),
             "APPLIANCE_PORT": str(self.port),
         }
         for each in (programs, self.folder, self.clone / ".venv"):
@@ -241,7 +245,12 @@ class Site:
         """The line with its stand-ins and additions."""
         for words, stand_in in STAND_INS:
             line = line.replace(words, stand_in)
-        names = {"port": self.port, "user": self.user, "password": self.password}
+        names = {
+            "port": self.port,
+            "web_port": self.web_port,
+            "user": self.user,
+            "password": self.password,
+        }
         for name, value in names.items():
             line = line.replace(f"{{{name}}}", str(value))
         for pattern, more in ADDED:

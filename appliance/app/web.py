@@ -9,17 +9,19 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING
 
-from appliance.access import LoginPolicy, no_user
+from appliance.access import LoginPolicy, is_token, no_user
 from appliance.access.tokens import Tokens
 from appliance.app.metrics import Metrics, MetricsParts
 from appliance.app.reload import Reload
 from appliance.broker.broker import Broker
 from appliance.broker.histogram import Histogram
 from appliance.certs import TlsContexts
+from appliance.management.topics import topic_of
 from appliance.net.listeners import Listeners
 from appliance.ops.watchdog import Pulse
 from appliance.ros.bridge import Bridge
 from appliance.store import SessionStore
+from appliance.web.api import Api
 from appliance.web.authority import ca_certificate
 from appliance.web.console import Console
 from appliance.web.health import PartState, healthz, readyz
@@ -74,6 +76,7 @@ def site(parts: WebParts) -> WebSite:
             "/readyz": readyz(lambda: _states(parts)),
             "/ca.crt": ca_certificate(tls.authority if tls is not None else bytes),
             "/metrics": metrics(login, figures.render),
+            **Api(parts.listeners.carry, is_token, topic_of).resources,
         },
         _names(tls),
         tls.username if tls is not None else no_user,

@@ -85,9 +85,16 @@ class ClientConnection:
     """
 
     def __init__(
-        self, scheduler: Scheduler, address: str, host: str, anonymous: bool | None = None
+        self,
+        scheduler: Scheduler,
+        address: str,
+        host: str,
+        anonymous: bool | None = None,
+        outer_tls: ssl.SSLObject | None = None,
     ) -> None:
+        """`outer_tls` is the TLS of a connection that this one is carried by."""
         self.address = address
+        self._outer_tls = outer_tls
         #: Whether its listener admits clients without a name; None: as configured for all.
         self.anonymous = anonymous
         #: The host part of `address`; empty for a Unix socket.
@@ -225,8 +232,8 @@ class ClientConnection:
     @property
     def _tls(self) -> ssl.SSLObject | None:
         """The TLS of the connection, if it has any."""
-        if self._transport is None:
-            return None
+        if self._transport is None or self._outer_tls is not None:
+            return self._outer_tls
         return cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object"))
 
     def check_certificate(self) -> None:
@@ -786,7 +793,7 @@ class ClientConnection:
 
     def tls_info(self) -> TlsInfo:
         """The version of TLS, and the name in the client's certificate."""
-        peer = self._transport.get_extra_info("ssl_object") if self._transport else None
+        peer = self._tls
         if peer is None:
             return TlsInfo()
         return TlsInfo(peer.version() or "", tls.name_in(peer.getpeercert()))

@@ -4,8 +4,9 @@ What is asked for is answered by an `HttpSite`. A request for a WebSocket on `/m
 layer: the connection is that of an MQTT client from there on, as on a listener for WebSocket.
 
 A request is taken when the one before it was answered and its answer was read; until then nothing
-is read from the client. Requests have no body. An answer that is ready waits for a turn if the
-round is used up: what many requests wait for may come for all of them at once.
+is read from the client. A request has a body where the site takes one, and says how long it is; it
+is read when whoever answers asks for it. An answer that is ready waits for a turn if the round is
+used up: what many requests wait for may come for all of them at once.
 
 A connection is a guest of its listener for all its life: it makes room when there are too many, see
 `Listeners`.
@@ -63,6 +64,24 @@ BODY_PORTION = 64 * 1024
 EMPTY_LINES = 64
 
 
+class HttpError(Exception):
+    """Why a request is not served: the status of the answer, and its words."""
+
+    def __init__(self, status: int, words: str) -> None:
+        super().__init__(words)
+        self.status = status
+
+
+class Exchange(Protocol):
+    """A request that is being answered, as who answers sees it."""
+
+    async def receive(self, length: int) -> bytes:
+        """The request's body, which has this length; once. Raises HttpError."""
+
+    def allow(self, seconds: float) -> None:
+        """Let the answer take so long from now on."""
+
+
 @dataclass(frozen=True, slots=True)
 class HttpRequest:
     """A request: `path` as it was sent, without the query; names of `headers` in lower case.
@@ -82,6 +101,23 @@ class HttpRequest:
     peer: str
     tls: ssl.SSLObject | None
     anonymous: bool | None
+
+    #: The length of its body in bytes, as stated, and the exchange that it comes by.
+    length: int = 0
+    exchange: Exchange | None = field(default=None, repr=False)
+
+    async def body(self, most: int) -> bytes:
+        """The body, of `most` bytes at most. Raises HttpError."""
+        if self.exchange is None or not self.length:
+            return b""
+        if self.length > most:
+            raise HttpError(413, f"a body has {most} bytes at most here")
+        return await self.exchange.receive(self.length)
+
+    def allow(self, seconds: float) -> None:
+        """Let the answer take so long from now on."""
+        if self.exchange is not None:
+            self.exchange.allow(seconds)
 
     def get(self, name: str) -> str | None:
         """The header of that name in lower case; None if there is none, or more than one."""
@@ -109,6 +145,9 @@ class HttpSite(Protocol):
 
     def respond(self, request: HttpRequest) -> Awaitable[HttpResponse]:
         """Answer a request; an exception ends the connection."""
+
+    def takes_body(self, request: HttpRequest) -> bool:
+        """Whether the request may have a body."""
 
     def objection(self, request: HttpRequest) -> HttpResponse | None:
         """Why the request may not become a WebSocket; None if it may."""
@@ -166,6 +205,9 @@ class HttpLayer(MiddleLayer):
         #: The body that is being sent, and how many bytes of it the transport has.
         self._body = b""
         self._sent = 0
+        #: Who answers waits for the request's body, of this length.
+        self._awaited: asyncio.Future[None] | None = None
+        self._length = 0
         #: A request is being answered, or its answer is not read yet.
         self._busy = False
         self._writing = True
@@ -197,6 +239,9 @@ class HttpLayer(MiddleLayer):
                 self._take_later()
             else:
                 self._take()
+        elif self._awaited is not None and len(self._received) >= self._length:
+            self._pause()
+            self._end_body(None)
         self._count_own(len(self._received))
 
     def _limit(self, seconds: float) -> None:
@@ -210,7 +255,9 @@ class HttpLayer(MiddleLayer):
     def _too_late(self) -> None:
         if self._transport.is_closing():
             return
-        if self._busy or not self._writing:
+        if self._awaited is not None:
+            self._end_body(HttpError(408, f"no complete request within {self._timeout:g} s"))
+        elif self._busy or not self._writing:
             what = "ready" if self._http.our_state is h11.SEND_RESPONSE else "read"
             self._protocol.log_refusal("no HTTP answer", f"none was {what} in {self._timeout:g} s")
             self._protocol.abort()
@@ -291,13 +338,15 @@ class HttpLayer(MiddleLayer):
         self._method = event.method.decode("ascii")
         if not event.http_version.startswith(b"1."):
             self._refuse(505, "HTTP/1.1 is spoken here")
-        elif type(following) is not h11.EndOfMessage or http.trailing_data[0]:
-            # Its length would have to be believed before anybody has wanted it.
-            self._refuse(413, "requests have no body here")
         else:
             request = self._request(event)
+            has_body = type(following) is not h11.EndOfMessage or bool(http.trailing_data[0])
             if request is None:
                 self._refuse(400, "not a request for a path of this server")
+            elif has_body and not self._site.takes_body(request):
+                self._refuse(413, "requests have no body here")
+            elif has_body and not request.length:
+                self._refuse(411, "a body has a Content-Length here")
             elif _is_upgrade(request):
                 self._upgrade(request, head)
             else:
@@ -316,6 +365,7 @@ class HttpLayer(MiddleLayer):
         if not target.startswith("/"):
             return None
         path, _, query = target.partition("?")
+        is_coded = any(name == "transfer-encoding" for name, _ in headers)
         protocol = self._protocol
         return HttpRequest(
             self._method,
@@ -327,6 +377,9 @@ class HttpLayer(MiddleLayer):
             protocol.host,
             cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object")),
             protocol.anonymous,
+            # h11 has checked that it is one number; it means nothing beside a coding.
+            0 if is_coded else int(next((v for k, v in headers if k == "content-length"), "0")),
+            self,
         )
 
     def _begin(self, request: HttpRequest) -> None:
@@ -336,9 +389,51 @@ class HttpLayer(MiddleLayer):
         self._limit(self._timeout)
         self._scheduler.in_background(self._respond(request))
 
+    async def receive(self, length: int) -> bytes:
+        """The body of the request that is answered; see `Exchange`."""
+        http = self._http
+        self._limit(self._timeout)
+        if len(self._received) < length:
+            if self._transport.is_closing():
+                raise HttpError(400, "the body is cut off")
+            if http.they_are_waiting_for_100_continue:
+                go_on = h11.InformationalResponse(status_code=100, headers=[])
+                self._transport.write(http.send(go_on))
+            self._length = length
+            self._awaited = asyncio.get_running_loop().create_future()
+            self._read_on()
+            await self._awaited
+        body = bytes(self._received[:length])
+        del self._received[:length]
+        self._count_own(len(self._received))
+        self._scheduler.count_cost(length // BODY_PER_COST_UNIT, self._protocol)
+        http.receive_data(body)
+        while type(http.next_event()) is h11.Data:
+            pass
+        self._limit(self._timeout)
+        return body
+
+    def _end_body(self, error: HttpError | None) -> None:
+        """Nobody waits for the body any more: it is there, or it will not come."""
+        awaited, self._awaited = self._awaited, None
+        if awaited is None or awaited.done():
+            return
+        if error is None:
+            awaited.set_result(None)
+        else:
+            awaited.set_exception(error)
+
+    def allow(self, seconds: float) -> None:
+        """Let the answer take so long from now on; see `Exchange`."""
+        if not self._transport.is_closing():
+            self._limit(seconds)
+
     async def _respond(self, request: HttpRequest) -> None:
         try:
-            response = await self._site.respond(request)
+            try:
+                response = await self._site.respond(request)
+            except HttpError as error:
+                response = text(error.status, str(error))
             # As a small chunk, not behind all others: `/healthz` answers also without any turns.
             if self._scheduler.must_wait(self._protocol, is_small=True):
                 self._response = response
@@ -359,6 +454,8 @@ class HttpLayer(MiddleLayer):
     def _answer(self, response: HttpResponse, *more: tuple[str, str]) -> None:
         """Send the answer; go on when it was read."""
         http = self._http
+        if http.their_state is h11.SEND_BODY:  # what comes yet is no request
+            more = (("Connection", "close"),)
         headers: Iterable[tuple[str, str]] = (
             ("Date", formatdate(usegmt=True)),
             ("Content-Type", response.content_type),
@@ -470,6 +567,7 @@ class HttpLayer(MiddleLayer):
         """The connection has ended, from either side."""
         if self._deadline is not None:
             self._deadline.cancel()
+        self._end_body(HttpError(400, "the body is cut off"))
         self._received.clear()
         self._protocol.connection_lost(exc)
 

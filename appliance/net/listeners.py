@@ -221,26 +221,16 @@ class Listeners:
 
     def admit(self, connection: socket.socket, peer: object, listener: ListenerSettings) -> None:
         """Begin an accepted connection, or close it if the limits refuse it."""
-        counters = self.broker.counters
-        counters.sockets += 1
-        now = asyncio.get_running_loop().time()
-        refusal = host = ""
+        self.broker.counters.sockets += 1
+        host = ""
         if listener.path is not None:
             # In the place of a port, a number that no other open connection has.
             address = f"unix:{listener.path}:{connection.fileno()}"
         else:
             host, port = cast("tuple[str, int]", peer)[:2]
             address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        if listener.path is None:
-            refusal = self._addresses.reserve(host, now)
-        if not refusal:
-            refusal = self._make_room()
-        if refusal:
+        if self._refuse(address, host):
             connection.close()
-            counters.connections_refused += 1
-            self.broker.rate_limited_log.warning(now, refusal, "%s refused: %s", address, refusal)
-            if self.broker.audit_log is not None:
-                self.broker.audit_log.refused(address, refusal)
             return
         protocol = ClientConnection(self.scheduler, address, host, listener.anonymous)
         self.scheduler.connections.add(protocol)
@@ -251,6 +241,36 @@ class Listeners:
             self._handshakes.add(protocol)
         layer = self._layer(listener)
         self.scheduler.in_background(self._begin(protocol, connection, context, layer))
+
+    def _refuse(self, address: str, host: str) -> str:
+        """Why the limits refuse a new connection, which is counted and logged; empty if not."""
+        now = asyncio.get_running_loop().time()
+        refusal = (self._addresses.reserve(host, now) if host else "") or self._make_room()
+        if refusal:
+            self.broker.counters.connections_refused += 1
+            self.broker.rate_limited_log.warning(now, refusal, "%s refused: %s", address, refusal)
+            if self.broker.audit_log is not None:
+                self.broker.audit_log.refused(address, refusal)
+        return refusal
+
+    def carry(
+        self, address: str, host: str, tls: ssl.SSLObject | None, anonymous: bool | None
+    ) -> socket.socket | None:
+        """The client's end of a new connection within this process; None if the limits refuse it.
+
+        Who asks from there over another protocol is a client of MQTT by it: with all limits, and
+        the identity that its own connection's `tls` gives.
+        """
+        if self._refuse(address, host):
+            return None
+        ours, theirs = socket.socketpair()
+        for end in (ours, theirs):
+            end.setblocking(False)
+        protocol = ClientConnection(self.scheduler, address, host, anonymous, tls)
+        self.scheduler.connections.add(protocol)
+        self._addresses.add_guest(protocol)
+        self.scheduler.in_background(self._begin(protocol, ours, None, None))
+        return theirs
 
     def _layer(self, listener: ListenerSettings) -> _Layer:
         if listener.protocol == "websocket":

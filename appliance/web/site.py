@@ -27,6 +27,7 @@ class Resource:
 
     respond: Callable[[HttpRequest], Awaitable[HttpResponse]]
     methods: tuple[str, ...] = LOOK
+    takes_body: bool = False
 
 
 class WebSite:
@@ -53,14 +54,24 @@ class WebSite:
         refusal = self._misdirected(request)
         if refusal is not None:
             return refusal
-        first = request.path[1:].partition("/")[0]
-        resource = self._resources.get(request.path) or self._resources.get(f"/{first}/")
+        resource = self._at(request.path)
         if resource is None:
             return text(404, "nothing is here")
         if request.method not in resource.methods:
             allowed = ", ".join(resource.methods)
             return text(405, f"use one of: {allowed}", ("Allow", allowed))
+        if request.method not in LOOK and _has_foreign_origin(request):
+            return text(403, "a page of another site may not change anything here")
         return await resource.respond(request)
+
+    def takes_body(self, request: HttpRequest) -> bool:
+        """Whether the request may have a body; see `HttpSite`."""
+        resource = self._at(request.path)
+        return resource is not None and resource.takes_body and request.method not in LOOK
+
+    def _at(self, path: str) -> Resource | None:
+        first = path[1:].partition("/")[0]
+        return self._resources.get(path) or self._resources.get(f"/{first}/")
 
     def objection(self, request: HttpRequest) -> HttpResponse | None:
         """Why the request may not become a WebSocket; see `HttpSite`."""
@@ -74,18 +85,22 @@ class WebSite:
 
     def _foreign(self, request: HttpRequest) -> HttpResponse | None:
         """Refuse another site's page where the browser logs in by itself, by its certificate."""
-        origin = request.get("origin")
-        if origin is None and not any(name == "origin" for name, _ in request.headers):
-            return None  # not a browser
-        if request.tls is None:
+        if request.tls is None or not _has_foreign_origin(request):
             return None
         try:
             owner = self._certificate_user(request.tls)
         except ValueError:
             owner = None  # its login will be refused
-        if owner is None or (origin or "").lower() == f"https://{request.host}".lower():
+        if owner is None:
             return None
         return text(403, "a page of another site may not use this client's certificate")
+
+
+def _has_foreign_origin(request: HttpRequest) -> bool:
+    """Whether a page of another site has the browser ask; who is no browser sends no Origin."""
+    given = [value.lower() for name, value in request.headers if name == "origin"]
+    scheme = "http" if request.tls is None else "https"
+    return bool(given) and given != [f"{scheme}://{request.host}".lower()]
 
 
 def is_named(host: str, names: Collection[str]) -> bool:
