@@ -42,6 +42,13 @@ def shortened(text: str, width: int) -> str:
     return f"{head}{_ELLIPSIS}{tail}"
 
 
+def cut(text: str, width: int) -> str:
+    """The beginning of a sentence, in so many cells at most."""
+    if cell_len(text) <= width:
+        return text
+    return f"{text[: _fitting(text, width - 1)]}{_ELLIPSIS}" if width > 0 else ""
+
+
 def table(rows: Iterable[Sequence[str]], width: int | None = None) -> Iterator[str]:
     """The lines of a table: columns as wide as necessary or, in so many cells, as possible.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any, Final, Literal, TypeAlias
 
-from appliance.cli.tables import shortened, table, visible
+from appliance.cli.tables import cut, table, visible
 from appliance.config import about_size
 
 ARROWS: Final = {"to_mqtt": "→", "to_ros": "←"}
@@ -100,7 +100,7 @@ def lines(snapshot: Snapshot, sort: Sort, width: int | None, height: int | None)
 
 def _visible(line: Line, width: int | None) -> Line:
     text = visible(line.text)
-    return Line(text if width is None else shortened(text, width), line.style)
+    return Line(text if width is None else cut(text, width), line.style)
 
 
 def _clipped(found: list[Line], room: int) -> list[Line]:

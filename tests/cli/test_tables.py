@@ -12,7 +12,7 @@ from rich.cells import cell_len
 
 from appliance.cli import routes as command
 from appliance.cli import tables
-from appliance.cli.tables import fitted, shortened, table
+from appliance.cli.tables import cut, fitted, shortened, table
 
 ROWS = [
     ("ROS", "MQTT", "REASON"),
@@ -40,12 +40,13 @@ def test_every_line_fits(width: int) -> None:
 def test_names_lose_their_middle() -> None:
     assert shortened("/front/camera/image_raw", 15) == "/front/…age_raw"
     assert [shortened("abcdef", width) for width in (0, 1, 2, 6)] == ["", "…", "a…", "abcdef"]
+    assert [cut("abcdef", width) for width in (0, 1, 3, 6)] == ["", "…", "ab…", "abcdef"]
 
 
 @given(st.text(), st.integers(0, 30))
 def test_a_shortened_text_fits(text: str, width: int) -> None:
-    found = shortened(tables.visible(text), width)
-    assert cell_len(found) <= width
+    for shorter in (shortened, cut):
+        assert cell_len(shorter(tables.visible(text), width)) <= width
 
 
 @given(st.lists(st.integers(0, 70_000), min_size=1, max_size=12), st.integers(12, 300))
