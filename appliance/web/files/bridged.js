@@ -31,6 +31,7 @@ function Robot({ robot, routes }) {
 }
 
 function totalOf(routes) {
-  const sum = (name) => routes.reduce((total, { [name]: value }) => total + (Number.isFinite(value) ? value : 0), 0)
-  return `${sum('rate').toFixed(1)}, ${size(Math.round(sum('byte_rate')))}`
+  const sum = (of) => routes.reduce((total, route) => total + of(route), 0)
+  const bytes = sum(({ byte_rate: exact, rate = 0, size: mean = 0 }) => exact ?? rate * mean)
+  return `${sum(({ rate = 0 }) => rate).toFixed(1)} messages, ${size(Math.round(bytes))}`
 }
