@@ -2,7 +2,7 @@
 
 import assert from 'node:assert/strict'
 
-const { blank, faultOf, indented, objectText, valueOf } = await import(`${process.argv[2]}/json-text.js`)
+const { faultOf, indented, objectText, valueOf } = await import(`${process.argv[2]}/json-text.js`)
 const { Shelf, covers } = await import(`${process.argv[2]}/shelf.js`)
 const bytes = (text) => new TextEncoder().encode(text)
 
@@ -26,17 +26,6 @@ assert.equal(objectText([['a"b', '9007199254740993'], ['__proto__', '1']]), '{"a
 assert.match(faultOf('{"a": tru}'), /^Not JSON/)
 assert.equal(faultOf('[1]'), '')
 assert.equal(valueOf('{'), undefined)
-
-// Defaults by a schema, also by one that is recursive, hostile or none.
-const schema = {
-  properties: { n: { default: 5 }, time: { anyOf: [{ $ref: '#/$defs/a~1b' }, { const: 'now' }] }, some: { type: 'array', minItems: 2, items: { type: 'number' } } },
-  type: 'object',
-  $defs: { 'a/b': { type: 'object', properties: { sec: { type: 'integer' } } } },
-}
-assert.deepEqual(JSON.parse(blank(schema)), { n: 5, time: { sec: 0 }, some: [0, 0] })
-const loop = { type: 'object', properties: { again: { $ref: '#/$defs/loop' } }, $defs: {} }
-loop.$defs.loop = { type: 'array', minItems: 1e9, items: { $ref: '#/$defs/loop' } }
-for (const odd of [loop, null, 1, {}, { $ref: '#/$defs/toString' }, { type: 'object', properties: 7 }, { anyOf: [] }]) JSON.parse(blank(odd))
 
 // What is kept: the newest, of so many topics.
 class Client {

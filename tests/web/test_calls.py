@@ -52,28 +52,29 @@ def opened(visited: Visit, name: str, user: str = "alice") -> Any:
 
 
 def ask(page: Any, request: str, word: str) -> None:
-    """Fill in a request, once its defaults have come, and send it."""
-    page.wait_for_selector(".request details")
+    """Fill in a request, once its form is there, and send it."""
+    page.wait_for_selector(".request .both")
     page.fill(".request textarea", request)
     page.click(f"button:text-is('{word}')")
 
 
 def test_a_service(visit: Callable[..., Visit], robot: Robot) -> None:
-    """The defaults of its type, its answer, its errors, and one that never answers."""
+    """The form of its type, its answer, its errors, and one that never answers."""
     visited = visit(**PHONE)
     page = opened(visited, "/turtle/pen")
-    page.wait_for_selector(".request details")
-    assert json.loads(page.input_value(".request textarea")) == {"data": False}
+    page.wait_for_selector(".request .both")
     page.click("button:text-is('Call')")
     page.wait_for_selector('[aria-label=Answer]:has-text(\'"message": "up"\')')
-    ask(page, '{"data": true}', "Call")
+    page.check(".request input[type=checkbox]")
+    assert json.loads(page.input_value(".request textarea")) == {"data": True}
+    page.click("button:text-is('Call')")
     page.wait_for_selector('[aria-label=Answer]:has-text(\'"message": "down"\')')
     assert " ms" in page.inner_text(".call")
     visited.look("phone-calls-1-service")
     ask(page, '{"data": tru}', "Call")
     page.wait_for_selector(".request .bad:has-text('Not JSON')")
     ask(page, '{"data": 1}', "Call")
-    page.wait_for_selector(".call .bad:has-text('bad_request: data')")
+    page.wait_for_selector(".warnings:has-text('data expected true or false')")
     page.click("text=Close")
     page.click(".row:has(bdi:text-is('/turtle/think'))")
     page.click("button:text-is('Call')")

@@ -4,12 +4,14 @@ import { h } from './vendor/preact.mjs'
 import { useEffect, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
 import { shelf, shelve, verb } from './link.js'
-import { blank, faultOf, indented, valueOf } from './json-text.js'
+import { Editor, mayBeSent, useMessage } from './editor.js'
+import { indented } from './json-text.js'
 
 export const html = htm.bind(h)
 
 const MOST_QUESTIONS = 200 // of the verb `rights` in one call
 const LONGEST = 600 // seconds that an answer is waited for
+const LARGEST = 1024 * 1024 // characters of a request
 const RESERVE = 2 // seconds until the appliance's own answer, that time is over, has come
 
 /** Keep topics while a page is open and can be seen: pairs of a filter and messages a second. */
@@ -73,25 +75,29 @@ export function Json({ text, label }) {
   return html`<pre tabindex="0" aria-label=${label}>${indented(text)}</pre>`
 }
 
-/** A form for a request: JSON, filled in with the defaults of its schema. `send` gets its text. */
+/** What is wrong with a field, by the words of a call that was refused; null where they name none. */
+function refusedField(words) {
+  const found = /^bad_request: ([\w.[\]]+): (.*)$/s.exec(words)
+  return found && { path: found[1], words: found[2] }
+}
+
+/** A form for a request; fields that are left out have their default. `send` gets its text, and returns what went wrong. */
 export function Request({ schema, word, lacking, isBusy, send }) {
-  const [text, setText] = useState(null)
-  const [fault, setFault] = useState('')
-  const described = schema?.isJson ? valueOf(schema.text) : undefined
-  const filled = text ?? (described ? blank(described) : '{}')
-  const submit = (event) => {
-    event.preventDefault()
-    const found = filled.trim() ? faultOf(filled) : ''
-    setFault(found)
-    if (!found) send(filled)
+  const [text, setText] = useState('{}')
+  const [refused, setRefused] = useState(null)
+  const message = useMessage(text, schema, refused)
+  const edit = (next) => {
+    setText(next)
+    setRefused(null)
   }
-  return html`<form class="request" onSubmit=${submit}>
-    <label>Request <textarea rows=${Math.min(16, filled.split('\n').length + 1)} spellcheck=${false}
-      aria-invalid=${fault ? 'true' : null} value=${filled}
-      onInput=${(event) => setText(event.currentTarget.value)}></textarea></label>
-    ${fault && html`<p class="bad" role="alert">${fault}</p>`}
+  const submit = async (event) => {
+    event.preventDefault()
+    if (!mayBeSent(message, refused, event.currentTarget)) return
+    setRefused(refusedField(await send(text)))
+  }
+  return html`<form class="publish request" onSubmit=${submit}>
+    <${Editor} label="Request" text=${text} message=${message} most=${LARGEST} edit=${edit} />
     <div class="tools"><button disabled=${Boolean(lacking) || isBusy}>${word}</button>
-      <button type="button" disabled=${text === null} onClick=${() => { setText(null); setFault('') }}>Defaults</button></div>
-    ${schema && html`<details><summary>Schema</summary><${Json} text=${schema.text} label="Schema" /></details>`}
+      <button type="button" disabled=${text === '{}'} onClick=${() => edit('{}')}>Start again</button></div>
   </form>`
 }

@@ -24,8 +24,10 @@ export default function Goals({ entry }) {
     try {
       remember(mqtt, valueOf(await request(`${mqtt}/_goal`, payload, patience(entry)))?.goal_id)
       setState({ isBusy: false, error: '' })
+      return ''
     } catch (error) {
       setState({ isBusy: false, error: error.message })
+      return error.message
     }
   }
   const goals = goalsOf(mqtt, told.topics)

@@ -69,36 +69,3 @@ export function valueOf(text) {
     return undefined
   }
 }
-
-const FILLED = 500 // values that are filled in
-const NESTED = 12
-
-/** The JSON text of a message with every field's default, by its JSON Schema. */
-export function blank(schema) {
-  let left = FILLED
-  const fill = (part, depth) => {
-    left -= 1
-    if (left < 0 || depth > NESTED || part === null || typeof part !== 'object') return null
-    if (Object.hasOwn(part, 'default')) return part.default
-    if (typeof part.$ref === 'string') return fill(definition(schema, part.$ref), depth + 1)
-    if (Array.isArray(part.anyOf)) return fill(part.anyOf[0], depth + 1)
-    const type = [part.type].flat()[0]
-    if (type === 'object') {
-      // No prototype: the names are a stranger's.
-      const value = Object.create(null)
-      for (const [name, inner] of Object.entries(part.properties ?? {})) value[name] = fill(inner, depth + 1)
-      return value
-    }
-    if (type === 'array') {
-      const count = Math.min(part.minItems ?? 0, 100)
-      return Array.from({ length: count }, () => fill(part.items, depth + 1))
-    }
-    return { boolean: false, string: '', integer: 0, number: 0 }[type] ?? null
-  }
-  return JSON.stringify(fill(schema, 0), null, 2)
-}
-
-function definition(schema, reference) {
-  const name = reference.replace(/^#\/\$defs\//, '').replaceAll('~1', '/').replaceAll('~0', '~')
-  return Object.hasOwn(schema.$defs ?? {}, name) ? schema.$defs[name] : null
-}

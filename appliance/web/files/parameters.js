@@ -75,7 +75,7 @@ export default function Parameters({ entry }) {
       onInput=${(event) => seek(event.currentTarget.value)} /></div>
     <${Refused} told=${told} />
     ${lines.length > 0 && html`<${Lacking} line=${lines[0]} what="set all of these" />`}
-    <form class="request" onSubmit=${set}>
+    <form class="publish" onSubmit=${set}>
       ${parameters.length === 0 && html`<p class="quiet">No values have come.</p>`}
       ${shown.map(([name, text]) => {
     const type = typeOf(text)

@@ -2,13 +2,11 @@
 // What is sent is the text as it stands, so that no number goes through a float.
 
 import { h } from './vendor/preact.mjs'
-import { useMemo, useState } from './vendor/hooks.mjs'
+import { useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
 import { ask, robots } from './link.js'
-import { lack, Lacking, schemaOf as topicOfSchema, useRights, useShelf } from './calling.js'
-import { parse, print } from './exact.js'
-import { errorsOf, Form } from './form.js'
-import { schemaOf } from './schema.js'
+import { lack, Lacking, schemaOf, useRights, useShelf } from './calling.js'
+import { Editor, mayBeSent, useMessage } from './editor.js'
 
 const html = htm.bind(h)
 
@@ -55,10 +53,9 @@ function formatOf({ encoding }) {
 }
 
 function Message({ topic, route }) {
-  const schemaTopic = route?.encoding === 'json' ? topicOfSchema(route, '') : null
+  const schemaTopic = route?.encoding === 'json' ? schemaOf(route, '') : null
   const told = useShelf(schemaTopic ? [[schemaTopic, 1]] : [])
   const schema = schemaTopic ? told.topics.get(schemaTopic) : undefined
-  const root = useMemo(() => (schema?.isJson ? schemaOf(schema.text) : null), [schema?.text])
   const line = lack(useRights([topic]), topic)
   const [chosen, setFormat] = useState('json')
   const format = route ? formatOf(route) : chosen
@@ -66,11 +63,7 @@ function Message({ topic, route }) {
   const [answer, setAnswer] = useState(null)
   const [isBusy, setBusy] = useState(false)
   const payload = text ?? (format === 'json' ? '{}' : '')
-  const read = useMemo(() => (format === 'json' ? reading(payload) : {}), [payload, format])
-  const errors = useMemo(
-    () => (read.value === undefined ? new Map() : errorsOf(root, read.value, answer?.refused)),
-    [root, read, answer],
-  )
+  const message = useMessage(payload, schema, answer?.refused, format === 'json')
   const edit = (next) => {
     setText(next)
     setAnswer(null)
@@ -78,11 +71,7 @@ function Message({ topic, route }) {
   const submit = async (event) => {
     event.preventDefault()
     const form = event.currentTarget
-    const isRefused = answer?.refused && errors.size === 1
-    if (read.fault || (errors.size && !isRefused)) {
-      setTimeout(() => form.querySelector('[aria-invalid]')?.focus())
-      return
-    }
+    if (!mayBeSent(message, answer?.refused, form)) return
     setBusy(true)
     try {
       setAnswer(await publish(topic, route, format, payload, form.elements))
@@ -93,33 +82,17 @@ function Message({ topic, route }) {
   }
   return html`<form class="publish" onSubmit=${submit}>
     <h2><bdi>${topic.slice(0, 200)}</bdi></h2>
-    <${About} route=${route} format=${format} schema=${schema} root=${root} refused=${told.refused} />
+    <${About} route=${route} format=${format} schema=${schema} root=${message.root} refused=${told.refused} />
     ${!route && html`<label>Format <select value=${chosen} onChange=${(event) => { setFormat(event.currentTarget.value); edit(null) }}>
       <option value="json">JSON</option><option value="text">Text</option><option value="base64">Bytes, as base64</option></select></label>`}
-    <div class=${root ? 'both' : ''}>
-      ${root && (read.value === undefined
-    ? html`<p class="notice">The form is there again when the JSON is right.</p>`
-    : html`<${Form} root=${root} value=${read.value} errors=${errors} change=${(value) => edit(print(value))} />`)}
-      <div class="raw"><label>${format === 'json' ? 'JSON' : format === 'text' ? 'Text' : 'Base64'}
-        <textarea rows=${Math.min(24, payload.split('\n', 24).length + 2)} spellcheck=${false} maxlength=${LARGEST} value=${payload}
-          aria-invalid=${read.fault ? 'true' : null} onInput=${(event) => edit(event.currentTarget.value)}></textarea></label>
-        ${read.fault && html`<p class="bad" role="alert">Not JSON: ${read.fault}</p>`}
-        <${Errors} errors=${errors} /></div>
-    </div>
+    <${Editor} label=${format === 'json' ? 'JSON' : format === 'text' ? 'Text' : 'Base64'} text=${payload} message=${message}
+      most=${LARGEST} edit=${edit} />
     <${Options} />
     <${Lacking} line=${line} what="publish here" />
     <div class="tools"><button disabled=${Boolean(line) || isBusy}>${isBusy ? 'Waiting …' : 'Publish'}</button>
       <button type="button" onClick=${() => edit(null)}>Start again</button></div>
     <div role="status">${answer && html`<p class=${`notice ${answer.isBad ? 'bad' : ''}`}>${answer.words}</p>`}</div>
   </form>`
-}
-
-function reading(text) {
-  try {
-    return { value: parse(text) }
-  } catch (error) {
-    return { fault: error.message }
-  }
 }
 
 function About({ route, format, schema, root, refused }) {
@@ -130,12 +103,6 @@ function About({ route, format, schema, root, refused }) {
     ${refused.length > 0 && html`<p class="notice">Without its schema there is no form. The access rules would need the line:
       <code>topic read ${refused[0]}</code></p>`}
     ${schema && root === null && html`<p class="notice">The schema cannot be used: there is no form.</p>`}`
-}
-
-function Errors({ errors }) {
-  if (errors.size === 0) return null
-  return html`<ul class="warnings" aria-label="What is wrong">${[...errors].slice(0, 20).map(([path, words]) => html`
-    <li key=${path}><strong><bdi>${path.slice(0, 200) || 'The message'}</bdi></strong> ${words}</li>`)}</ul>`
 }
 
 function Options() {

@@ -32,6 +32,7 @@ export default function Service({ entry }) {
     said.took = Math.round(performance.now() - begun)
     history.value = [said, ...history.peek()].slice(0, KEPT)
     setBusy(false)
+    return said.error ?? ''
   }
   const calls = history.value.filter((each) => each.mqtt === mqtt)
   return html`<p class="quiet"><bdi>${type}</bdi></p>
