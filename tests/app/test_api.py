@@ -172,6 +172,14 @@ async def test_a_token(web: WebApp):
     assert (await web.get("/api/v1/status", **bearer))[0] == 401
 
 
+async def test_a_client_certificate(web: WebApp, monkeypatch: pytest.MonkeyPatch):
+    """It is that of the connection with the request which says who asks."""
+    monkeypatch.setattr(web.app._login, "_certificate_user", lambda tls: "admin")
+    assert (await web.get("/api/v1/status", tls=True))[0] == 200
+    assert (await web.get("/api/v1/status", tls=True, **basic("viewer")))[0] == 401
+    assert (await web.get("/api/v1/status"))[0] == 401
+
+
 async def test_calls(web: WebApp):
     def verb(name: str, **more: Any) -> dict[str, Any]:
         return {"topic": f"$CONTROL/appliance/v1/{name}/_call", **more}
