@@ -95,6 +95,9 @@ def test_a_camera(visit: Callable[..., Visit], appliance: ApplianceProcess) -> N
     first = pixels(page)
     eventually(lambda: pixels(page) != first, "the picture moves")
     visited.look("phone-camera")
+    with page.expect_download() as download:
+        page.click("text=Save the picture")
+    assert download.value.path().read_bytes().startswith(b"\x89PNG")
     assert rates(appliance, CAMERA) == [5]
     show_as(page, hidden=True)
     eventually(lambda: rates(appliance, CAMERA) == [], "the subscription has ended")
@@ -129,13 +132,16 @@ NO_PICTURES = [
 def test_pictures_that_are_none(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
     """Each says what is wrong with it, and the next picture is shown."""
     topic = f"{ROBOT}/hostile/<b>camera"
-    page = visit(**DESKTOP).sign_in(page="Camera")
+    visited = visit(color_scheme="dark", **DESKTOP)
+    page = visited.sign_in(page="Camera")
     page.evaluate("topic => location.hash = '#/camera/' + encodeURIComponent(topic)", topic)
     eventually(lambda: rates(appliance, topic) == [5], "the page subscribes")
     with Peer(appliance, V5) as peer:
         for content_type, payload, words in NO_PICTURES:
             peer.publish(topic, payload, ContentType=content_type)
             page.wait_for_selector(f".notice.bad:has-text('{words}')")
+            if content_type == "text/html":
+                visited.look("desktop-camera-bad")
             peer.publish(topic, PIXEL, ContentType="image/png")
             page.wait_for_selector(".notice.bad", state="detached")
         page.wait_for_selector("dd:text-is('1 × 1')")

@@ -100,7 +100,7 @@ function Pictures({ topic, isPossible }) {
         ${isPaused ? 'Continue' : 'Pause'}</button>
       <button disabled=${last === null} onClick=${keep}>Save the picture</button>
     </div>
-    <canvas class=${`video ${isOld || isPaused ? 'old' : ''}`} ref=${canvas} width="640" height="360" role="img"
+    <canvas class=${`video ${isOld || isPaused || problem ? 'old' : ''}`} ref=${canvas} width="640" height="360" role="img"
       aria-label=${`Picture of ${topic}`} />
     <dl class="tiles">
       <div><dt>Pictures a second</dt><dd>${isOn ? rateOf(frames) : 'paused'}</dd></div>

@@ -145,7 +145,7 @@ export class MapCanvas {
     const colour = (name) => style.getPropertyValue(name)
     const metres = () => context.setTransform(scale, 0, 0, -scale, width / 2 - view.x * scale, height / 2 + view.y * scale)
     context.setTransform(1, 0, 0, 1, 0, 0)
-    context.fillStyle = colour('--card')
+    context.fillStyle = colour('--line')
     context.fillRect(0, 0, width, height)
     metres()
     if (parts.grid && this.bitmap) this.paintGrid(context, parts.grid)
