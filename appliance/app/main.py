@@ -303,17 +303,18 @@ class App:
 
         return site(
             WebParts(
+                version("ros-mqtt-appliance"),
                 self.broker,
-                self._tls,
-                self._login,
-                self._pulse,
-                self._listeners,
                 self._store,
                 lambda: self.bridge,
                 lambda: self.upstreams,
                 lambda: self._reload if self._status is not None else None,
                 self._lag,
                 self._access.tokens,
+                self._tls,
+                self._login,
+                self._pulse,
+                self._listeners,
             )
         )
 

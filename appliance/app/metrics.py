@@ -53,7 +53,7 @@ _ROUTES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class MetricsParts:
-    """The parts whose counters are shown. The last ones begin after the listeners.
+    """The parts whose counters are shown. The bridge, links and reloads begin after the listeners.
 
     Until `reload` returns one, the appliance starts.
     """

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
-from typing import TYPE_CHECKING
 
 from appliance.access import LoginPolicy, is_token, no_user
-from appliance.access.tokens import Tokens
 from appliance.app.metrics import Metrics, MetricsParts
-from appliance.app.reload import Reload
-from appliance.broker.broker import Broker
-from appliance.broker.histogram import Histogram
 from appliance.certs import TlsContexts
 from appliance.management.topics import topic_of
 from appliance.net.listeners import Listeners
 from appliance.ops.watchdog import Pulse
-from appliance.ros.bridge import Bridge
-from appliance.store import SessionStore
 from appliance.web.api import Api
 from appliance.web.authority import ca_certificate
 from appliance.web.console import Console
@@ -29,53 +21,31 @@ from appliance.web.login import WebLogin
 from appliance.web.metrics import metrics
 from appliance.web.site import WebSite
 
-if TYPE_CHECKING:
-    from appliance.upstream.uplink import Uplink
-
 #: Each of its addresses is this computer.
 LOCALHOST = "localhost"
 
 
 @dataclass(frozen=True, slots=True)
-class WebParts:
-    """What the web is about. The bridge, the links and reloads begin after the listeners."""
+class WebParts(MetricsParts):
+    """What the web is about: what the metrics are, and these."""
 
-    broker: Broker
     tls: TlsContexts | None
     login: LoginPolicy
     pulse: Pulse
     listeners: Listeners
-    store: SessionStore
-    bridge: Callable[[], Bridge | None]
-    upstreams: Callable[[], Sequence[Uplink]]
-    reload: Callable[[], Reload | None]
-    lag: Histogram
-    tokens: Tokens
 
 
 def site(parts: WebParts) -> WebSite:
     """All that is served."""
     tls = parts.tls
     login = WebLogin(parts.broker, parts.login, asyncio.get_running_loop().time)
-    figures = Metrics(
-        MetricsParts(
-            version("ros-mqtt-appliance"),
-            parts.broker,
-            parts.store,
-            parts.bridge,
-            parts.upstreams,
-            parts.reload,
-            parts.lag,
-            parts.tokens,
-        )
-    )
     return WebSite(
         {
             **Console().resources,
             "/healthz": healthz(parts.pulse.problem),
             "/readyz": readyz(lambda: _states(parts)),
             "/ca.crt": ca_certificate(tls.authority if tls is not None else bytes),
-            "/metrics": metrics(login, figures.render),
+            "/metrics": metrics(login, Metrics(parts).render),
             **Api(parts.listeners.carry, is_token, topic_of).resources,
         },
         _names(tls),
