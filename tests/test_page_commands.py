@@ -63,7 +63,7 @@ STAND_INS = (
     ("appliance bench", "short-bench bench"),
     ("//broker.example", "//127.0.0.1:1"),  # nobody listens there
     ("https://robot.local:8443", "https://localhost:{web_port}"),
-    ("-u operator ", "-u {user}:{password} "),
+    ("--cacert ca.crt -u operator ", "--cacert ca.crt -u {user}:{password} "),
     ("--host robot.local", "--host localhost --port {port}"),
     (" … ", " -h localhost -p {port} --cafile certs/ca.crt -u {user} -P {password} "),
     # ROS's packages on PyPI have no navigation: the action is a Fibonacci.
