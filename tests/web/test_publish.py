@@ -76,6 +76,7 @@ def test_publish_with_a_mistake_then_rightly(
         assert json.loads(sent) == {"power_supply_status": 2, "voltage": 1e300}
         visited.look("desktop-publish-1-mistake")
         page.fill("#field-voltage", "12.50")
+        page.press("#field-voltage", "Enter")  # publishes nothing
         page.fill("#field-current", "nan")
         page.check("#field-present")
         page.click("summary:has-text('header')")

@@ -80,7 +80,7 @@ function Message({ topic, route }) {
     }
     setBusy(false)
   }
-  return html`<form class="publish" onSubmit=${submit}>
+  return html`<form class="publish" onSubmit=${submit} onKeyDown=${withoutEnter}>
     <h2><bdi>${topic.slice(0, 200)}</bdi></h2>
     <${About} route=${route} format=${format} schema=${schema} root=${message.root} refused=${told.refused} />
     ${!route && html`<label>Format <select value=${chosen} onChange=${(event) => { setFormat(event.currentTarget.value); edit(null) }}>
@@ -93,6 +93,11 @@ function Message({ topic, route }) {
       <button type="button" onClick=${() => edit(null)}>Start again</button></div>
     <div role="status">${answer && html`<p class=${`notice ${answer.isBad ? 'bad' : ''}`}>${answer.words}</p>`}</div>
   </form>`
+}
+
+/** A robot may move by what is published: Enter in a field is no decision to do so. */
+function withoutEnter(event) {
+  if (event.key === 'Enter' && event.target.tagName === 'INPUT') event.preventDefault()
 }
 
 function About({ route, format, schema, root, refused }) {
