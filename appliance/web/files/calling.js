@@ -4,7 +4,7 @@ import { h } from './vendor/preact.mjs'
 import { useEffect, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
 import { shelf, shelve, verb } from './link.js'
-import { Editor, mayBeSent, useMessage } from './editor.js'
+import { Editor, mayBeSent, useMessage, withoutEnter } from './editor.js'
 import { indented } from './json-text.js'
 
 export const html = htm.bind(h)
@@ -95,7 +95,7 @@ export function Request({ schema, word, lacking, isBusy, send }) {
     if (!mayBeSent(message, refused, event.currentTarget)) return
     setRefused(refusedField(await send(text)))
   }
-  return html`<form class="publish request" onSubmit=${submit}>
+  return html`<form class="publish request" onSubmit=${submit} onKeyDown=${withoutEnter}>
     <${Editor} label="Request" text=${text} message=${message} most=${LARGEST} edit=${edit} />
     <div class="tools"><button disabled=${Boolean(lacking) || isBusy}>${word}</button>
       <button type="button" disabled=${text === '{}'} onClick=${() => edit('{}')}>Start again</button></div>

@@ -43,6 +43,11 @@ export function mayBeSent({ fault, errors }, refused, form) {
   return false
 }
 
+/** Of a form for a message: a robot may move by what is sent, and Enter in a field is no decision to do so. */
+export function withoutEnter(event) {
+  if (event.key === 'Enter' && event.target.tagName === 'INPUT') event.preventDefault()
+}
+
 /** The form and the text; `edit` gets another text with each change. */
 export function Editor({ label, text, message, most, edit }) {
   const { root, value, fault, errors } = message

@@ -6,7 +6,7 @@ import { useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
 import { ask, robots } from './link.js'
 import { lack, Lacking, schemaOf, useRights, useShelf } from './calling.js'
-import { Editor, mayBeSent, useMessage } from './editor.js'
+import { Editor, mayBeSent, useMessage, withoutEnter } from './editor.js'
 
 const html = htm.bind(h)
 
@@ -93,11 +93,6 @@ function Message({ topic, route }) {
       <button type="button" onClick=${() => edit(null)}>Start again</button></div>
     <div role="status">${answer && html`<p class=${`notice ${answer.isBad ? 'bad' : ''}`}>${answer.words}</p>`}</div>
   </form>`
-}
-
-/** A robot may move by what is published: Enter in a field is no decision to do so. */
-function withoutEnter(event) {
-  if (event.key === 'Enter' && event.target.tagName === 'INPUT') event.preventDefault()
 }
 
 function About({ route, format, schema, root, refused }) {
