@@ -19,6 +19,7 @@ import psutil
 import uvloop
 
 from appliance.access import AccessFileError, FileAccess, LoginPolicy, no_user
+from appliance.access.enrolments import Enrolments
 from appliance.app import management, status, wiring
 from appliance.app.links import Links
 from appliance.app.own_topics import orphaned_topics
@@ -43,6 +44,7 @@ from appliance.config.plugins import PluginSettingsError
 from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
 from appliance.management.mqtt_calls import ManagementCalls
+from appliance.management.verbs import Verbs
 from appliance.net.callbacks import Entries, contained_proxy
 from appliance.net.listeners import Admission, Listeners
 from appliance.ops.audit import Audit, AuditError
@@ -119,6 +121,7 @@ class App:
         self._reload_requested = asyncio.Event()
         self._certificates_due = asyncio.Event()
         self._status: status.Status | None = None
+        self._verbs: Verbs | None = None
         #: How late the clock's ticks are, and so everything else on the loop.
         self._lag = Histogram()
 
@@ -196,6 +199,7 @@ class App:
         self._pulse = Pulse(broker, listeners.scheduler, self._inside, loop.time)
         self._tls, self._store = tls, store
         self._login, self._access = login, access
+        self._enrolments = Enrolments()
         self._start_clock(loop)
         # Before the listeners start, and stopped after them: whatever a client is acknowledged is
         # offered to the links.
@@ -315,6 +319,9 @@ class App:
                 self._login,
                 self._pulse,
                 self._listeners,
+                self._access,
+                self._enrolments,
+                lambda: self._verbs,
             )
         )
 
@@ -362,6 +369,7 @@ class App:
                 self.broker,
                 self._entries,
                 self._access,
+                self._enrolments,
                 self.bridge,
                 self.upstreams,
                 self._status,
@@ -476,6 +484,7 @@ class App:
         """Answer commands such as `appliance status`, and watch the files for changes."""
         settings = self.settings
         settings.control.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        assert self._verbs is not None
         control = Control(settings.control, self._verbs.commands, self.broker.faults)
         try:
             await control.start()

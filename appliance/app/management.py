@@ -7,12 +7,14 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from appliance.access import FileAccess
+from appliance.access.enrolments import Enrolments
 from appliance.app.reload import Reload, ReloadError
 from appliance.app.status import Status
 from appliance.broker.broker import Broker
 from appliance.certs.settings import authority_directory
 from appliance.management.certificates import CertificateVerbs
 from appliance.management.clients import ClientVerbs
+from appliance.management.enrolment import EnrolmentVerb
 from appliance.management.examination import DoctorVerb
 from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
@@ -40,6 +42,7 @@ class ManagementParts:
     broker: Broker
     entries: Entries
     access: FileAccess
+    enrolments: Enrolments
     bridge: Bridge | None
     upstreams: Sequence[Uplink]
     status: Status
@@ -64,6 +67,7 @@ def verbs(parts: ManagementParts) -> Verbs:
         *RightsVerbs(parts.broker, parts.access).verbs(),
         *UserVerbs(parts.access, take_over).verbs(),
         *TokenVerbs(parts.broker, parts.access).verbs(),
+        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments).verbs(),
         *CertificateVerbs(lambda: authority_directory(reload.settings.broker), take_over).verbs(),
         # Its path changes with a restart only.
         *RecordVerbs(reload.settings.broker.audit.path).verbs(),

@@ -7,10 +7,13 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.access import LoginPolicy, is_token, no_user
+from appliance.access import FileAccess, LoginPolicy, is_token, no_user
+from appliance.access.enrolments import Enrolments
+from appliance.app.enrolment import EnrolmentParts, enrol
 from appliance.app.metrics import Metrics, MetricsParts
 from appliance.certs import TlsContexts
 from appliance.management.topics import topic_of
+from appliance.management.verbs import Verbs
 from appliance.net.listeners import Listeners
 from appliance.ops.watchdog import Pulse
 from appliance.web.api import Api
@@ -33,6 +36,9 @@ class WebParts(MetricsParts):
     login: LoginPolicy
     pulse: Pulse
     listeners: Listeners
+    access: FileAccess
+    enrolments: Enrolments
+    verbs: Callable[[], Verbs | None]
 
 
 def site(parts: WebParts) -> WebSite:
@@ -47,6 +53,16 @@ def site(parts: WebParts) -> WebSite:
             "/ca.crt": ca_certificate(tls.authority if tls is not None else bytes),
             "/metrics": metrics(login, Metrics(parts).render),
             **Api(parts.listeners.carry, is_token, topic_of).resources,
+            "/enrol": enrol(
+                EnrolmentParts(
+                    parts.broker,
+                    parts.access,
+                    login,
+                    parts.enrolments,
+                    parts.verbs,
+                    lambda: _mqtts_port(parts.listeners),
+                )
+            ),
         },
         _names(tls),
         tls.username if tls is not None else no_user,
@@ -60,6 +76,14 @@ def _names(tls: TlsContexts | None) -> Callable[[], frozenset[str]]:
     host = socket.gethostname().lower()
     known = frozenset((LOCALHOST, host, f"{host.partition('.')[0]}.local"))
     return lambda: known
+
+
+def _mqtts_port(listeners: Listeners) -> int | None:
+    """The first port of MQTT over TLS, for apps; None where there is none."""
+    for (_, port), (_, settings) in zip(listeners.addresses, listeners.sockets(), strict=True):
+        if settings.protocol == "mqtt" and settings.context is not None and settings.path is None:
+            return port
+    return None
 
 
 def _states(parts: WebParts) -> dict[str, PartState]:

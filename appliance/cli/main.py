@@ -19,6 +19,7 @@ from appliance.cli.client import pub, sub
 from appliance.cli.clients import clients_app
 from appliance.cli.console import CommandError
 from appliance.cli.doctor import doctor
+from appliance.cli.enrol import user_enrol
 from appliance.cli.fastdds import fastdds
 from appliance.cli.install import install, uninstall
 from appliance.cli.routes import routes
@@ -40,6 +41,7 @@ LOOKING = (status, top, doctor, routes, upstream)
 USING = (pub, sub, call, goal)
 for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)
+user_app.command("enrol")(user_enrol)
 GROUPS = {
     "clients": clients_app,
     "param": param_app,

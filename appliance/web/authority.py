@@ -18,7 +18,7 @@ def ca_certificate(pem: Callable[[], bytes]) -> Resource:
     """
 
     async def respond(request: HttpRequest) -> HttpResponse:
-        if request.tls is None and not _is_local(request.peer):
+        if request.tls is None and not is_local(request.peer):
             return text(403, "ask over TLS: on the way here it could be replaced")
         certificate = pem()
         if not certificate:
@@ -29,7 +29,7 @@ def ca_certificate(pem: Callable[[], bytes]) -> Resource:
     return Resource(respond)
 
 
-def _is_local(peer: str) -> bool:
+def is_local(peer: str) -> bool:
     """Whether that is this computer: a Unix socket, or loopback."""
     if not peer:
         return True

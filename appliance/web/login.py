@@ -58,7 +58,7 @@ class WebLogin:
             if who.username is None and password is not None:
                 return text(401, "this is no token")  # and nobody either, where that is enough
             return who
-        self._note(request, username, who)
+        self.note(request, username, who)
         if who.code in WRONG_LOGIN:
             return text(401, "a user name and its password are needed")
         return text(503, "the login cannot be checked now", ("Retry-After", str(RETRY_AFTER)))
@@ -91,7 +91,7 @@ class WebLogin:
             decision = router.decide(who, Action.RECEIVE, topic)
         return decision
 
-    def _note(self, request: HttpRequest, username: str | None, refusal: Refusal) -> None:
+    def note(self, request: HttpRequest, username: str | None, refusal: Refusal) -> None:
         """Count a login that failed, and log it as MQTT's."""
         broker = self._broker
         broker.counters.logins_failed += refusal.code in WRONG_LOGIN

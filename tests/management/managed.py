@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 from harness import Peer, make_contexts
+from waiting import PATIENCE
 
 from appliance import config
 from appliance.access import Passwords
@@ -35,6 +36,7 @@ SETTINGS: dict[str, Any] = {
         "listeners": [{"bind": "127.0.0.1:0"}],
         "audit": {"path": "audit.log"},
         "sys_interval": "0 s",
+        "limits": {"connect_timeout": f"{PATIENCE:g} s"},  # however slow the computer is
     },
     "bridge": {"bus": "none"},
 }

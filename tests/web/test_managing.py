@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -130,7 +131,7 @@ def test_users(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None
     visited = visit(**DESKTOP)
     page = visited.sign_in(page="Access")
     page.click("summary:has-text('Add a user')")
-    add = page.locator("details form")
+    add = page.locator("details:has(summary:has-text('Add a user')) form")
     add.locator("input[name=user]").fill("bob <b>")
     add.locator("input[name=password]").fill("first-of-bob")
     add.locator("label:has-text('drivers') input").check()
@@ -160,10 +161,90 @@ def test_users(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None
     page.wait_for_selector("text='2 users'")
     bob.disconnected.get(timeout=PATIENCE)
     bob.stop()
-    page.locator("details form input[name=user]").fill("viewer")
-    page.locator("details form input[name=password]").fill("x")
-    page.locator("details form button").click()
+    add.locator("input[name=user]").fill("viewer")
+    add.locator("input[name=password]").fill("x")
+    add.locator("button").click()
     page.wait_for_selector(".notice.bad:has-text('there is a user')")
+
+
+def photographed(page: Any) -> str:
+    """What a phone reads from a picture of the screen."""
+    zxingcpp = pytest.importorskip("zxingcpp")
+    image = pytest.importorskip("PIL.Image")
+    codes = zxingcpp.read_barcodes(image.open(io.BytesIO(page.screenshot())))
+    assert len(codes) == 1
+    return str(codes[0].text)
+
+
+def begin_enrolment(page: Any, user: str, group: str = "") -> str:
+    """The URL in the QR code."""
+    page.click("summary:has-text('Enrol a phone')")
+    form = page.locator("details:has(summary:has-text('Enrol a phone')) form")
+    form.locator("input[name=user]").fill(user)
+    if group:
+        form.locator(f"label:has-text('{group}') input").check()
+    form.locator("button").click()
+    page.wait_for_selector(".code svg")
+    page.locator(".code svg").scroll_into_view_if_needed()
+    return photographed(page)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_enrol_a_phone(
+    visit: Callable[..., Visit], origin: str, appliance: ApplianceProcess, scheme: str
+) -> None:
+    """Journey 8: from the code as photographed to a phone that is signed in; once."""
+    user = f"carol {scheme}"
+    admin = visit(color_scheme=scheme, **DESKTOP)
+    page = admin.sign_in(page="Access")
+    page.wait_for_selector("text=/ users$/")
+    url = begin_enrolment(page, user, "viewers")
+    admin.look(f"desktop-{scheme}-enrol-code")
+    assert url.startswith(f"{origin}/#/enrol/")
+    visited = visit(color_scheme=scheme, **PHONE)
+    phone = visited.page
+    phone.goto("about:blank")
+    phone.goto(url)
+    phone.wait_for_selector(f"strong:has-text('{user}')")
+    visited.look(f"phone-{scheme}-enrol")
+    assert phone.evaluate("location.hash") == "#/enrol"
+    password = phone.input_value("input[name=password]")
+    assert len(password) == 19
+    phone.click("button:text-is('Set it and sign in')")
+    phone.wait_for_selector("a:has-text('To the console')")
+    phone.wait_for_selector(f"dd:text-is('{appliance.port}')")
+    visited.look(f"phone-{scheme}-enrolled")
+    phone.click("a:has-text('To the console')")
+    phone.wait_for_selector("h1:text-is('Overview')")
+    assert user in phone.inner_text(".user")
+    appliance.passwords[user] = password
+    Peer(appliance, V5, f"app of {user}", user=user).start().stop()
+    late = visit(**PHONE)
+    late.page.goto(url)
+    late.page.click("button:text-is('Set it and sign in')")
+    late.page.wait_for_selector(".notice.bad:has-text('was used')")
+    assert [told for told in late.wrong if "403" not in told] == []
+    late.wrong.clear()
+    assert password not in appliance.log and url.rpartition("#")[2] not in appliance.log
+
+
+def test_another_password_for_who_is_there(
+    visit: Callable[..., Visit], appliance: ApplianceProcess
+) -> None:
+    """Of a user that is there the code sets another password, and the page says so before."""
+    page = visit(**DESKTOP).sign_in(page="Access")
+    page.click("summary:has-text('Enrol a phone')")
+    page.fill("details:has(summary:has-text('Enrol a phone')) input[name=user]", "viewer")
+    page.wait_for_selector("text=/^This user is there/")
+    page.click("summary:has-text('Enrol a phone')")
+    url = begin_enrolment(page, "viewer")
+    phone = visit(**PHONE).page
+    phone.goto(url)
+    phone.fill("input[name=password]", "chosen-by-viewer")
+    phone.click("button:text-is('Set it and sign in')")
+    phone.click("a:has-text('To the console')")
+    appliance.passwords["viewer"] = "chosen-by-viewer"
+    Peer(appliance, V5, "app", user="viewer").start().stop()
 
 
 def test_explain(visit: Callable[..., Visit]) -> None:

@@ -3,7 +3,8 @@
 import { useState } from './vendor/hooks.mjs'
 import { shown } from './formats.js'
 import { user as self, verb } from './link.js'
-import { Form, Lacking, Problem, Question, Table, Tabs, html, lack, useAnswer, useRights } from './manage.js'
+import { Form, Groups, Lacking, Problem, Question, Table, Tabs, html, lack, ticked, useAnswer, useRights } from './manage.js'
+import { EnrolPhone } from './enrol-code.js'
 import { Certificates } from './certificates.js'
 
 const PARTS = [['users', 'Users'], ['explain', 'Explain'], ['certificates', 'Certificates']]
@@ -17,7 +18,7 @@ export default function Access({ topic }) {
     ${part === 'users' ? html`<${Users} />` : part === 'explain' ? html`<${Explain} />` : html`<${Certificates} />`}`
 }
 
-const USERS = ['users', 'user_add', 'user_password', 'user_remove', 'user_groups']
+const USERS = ['users', 'user_add', 'user_password', 'user_remove', 'user_groups', 'enrol']
 
 function Users() {
   const rights = useRights(USERS)
@@ -28,7 +29,7 @@ function Users() {
   const one = answer?.users.find(({ user }) => user === chosen)
   return html`
     <${Lacking} rights=${rights} of=${[['users', 'See the users'], ['user_add', 'Add one'],
-    ['user_password', 'Change a password'], ['user_groups', 'Change groups'], ['user_remove', 'Remove one']]} />
+    ['user_password', 'Change a password'], ['user_groups', 'Change groups'], ['user_remove', 'Remove one'], ['enrol', 'Enrol a phone']]} />
     <${Problem} words=${error} />
     ${answer && html`
       <div class="tools"><input type="search" aria-label="Search users" placeholder="Search" value=${sought}
@@ -47,21 +48,9 @@ function Users() {
       <p class="quiet" role="status">${found.length} users${found.length > SHOWN ? `, the first ${SHOWN}` : ''}</p>
       ${one && html`<${User} key=${one.user} one=${one} groups=${answer.groups} rights=${rights}
         changed=${again} close=${() => choose(null)} />`}`}
-    <details><summary>Add a user</summary><${Add} groups=${answer?.groups ?? null} rights=${rights} changed=${again} /></details>`
-}
-
-function Groups({ all, of }) {
-  if (all === null) return null
-  if (all.length === 0) return html`<p class="quiet">There are no groups: files in <code>groups</code> beside the ACL.</p>`
-  return html`<fieldset class="ticks"><legend>Groups</legend>${all.map((name) => html`
-    <label key=${name}><input type="checkbox" name="groups" value=${name} 
-      defaultChecked=${of.includes(name)} /> ${name}</label>`)}</fieldset>`
-}
-
-/** The names of the boxes that are ticked. */
-function ticked(fields) {
-  const boxes = fields.groups === undefined ? [] : fields.groups.length === undefined ? [fields.groups] : [...fields.groups]
-  return boxes.filter(({ checked }) => checked).map(({ value }) => value)
+    <details><summary>Add a user</summary><${Add} groups=${answer?.groups ?? null} rights=${rights} changed=${again} /></details>
+    <details><summary>Enrol a phone</summary><${EnrolPhone} users=${answer?.users ?? null} groups=${answer?.groups ?? null}
+      rights=${rights} /></details>`
 }
 
 function Password() {

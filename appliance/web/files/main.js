@@ -33,13 +33,14 @@ const LOADERS = {
   clients: () => import('./clients.js'),
   access: () => import('./access.js'),
   health: () => import('./health.js'),
+  enrol: () => import('./enrol.js'),
 }
 
 const place = signal(where())
 
 function where() {
   const [, page = '', ...rest] = location.hash.split('/')
-  const isKnown = PAGES.some(([name]) => name === page)
+  const isKnown = page === 'enrol' || PAGES.some(([name]) => name === page)
   let topic = ''
   try {
     topic = decodeURIComponent(rest.join('/'))
@@ -52,6 +53,8 @@ function where() {
 addEventListener('hashchange', () => { place.value = where() })
 
 function Console() {
+  const { page, topic } = place.value
+  if (page === 'enrol') return html`<${Later} key=${page} page=${page} topic=${topic} />`
   const { name } = session.value
   return name === 'in' || name === 'lost' ? html`<${Frame} />` : html`<${SignIn} />`
 }

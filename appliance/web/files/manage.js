@@ -106,6 +106,21 @@ export function Form({ word, lacking, act, children }) {
       ${told.words}</p>`}</form>`
 }
 
+/** Boxes for the groups of a user; `all` are null while they are not known. */
+export function Groups({ all, of }) {
+  if (all === null) return null
+  if (all.length === 0) return html`<p class="quiet">There are no groups: files in <code>groups</code> beside the ACL.</p>`
+  return html`<fieldset class="ticks"><legend>Groups</legend>${all.map((name) => html`
+    <label key=${name}><input type="checkbox" name="groups" value=${name} 
+      defaultChecked=${of.includes(name)} /> ${name}</label>`)}</fieldset>`
+}
+
+/** The names of the groups that are ticked in a form. */
+export function ticked(fields) {
+  const boxes = fields.groups === undefined ? [] : fields.groups.length === undefined ? [fields.groups] : [...fields.groups]
+  return boxes.filter(({ checked }) => checked).map(({ value }) => value)
+}
+
 /** A question before `act`, which ends with `done`; its first button changes nothing. */
 export function Question({ title, word, act, done, close, children }) {
   const dialog = useRef(null)

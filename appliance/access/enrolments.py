@@ -1,0 +1,77 @@
+"""Enrolments: one-time codes, each of which sets the password of one user once.
+
+Whoever manages users begins one and shows the code, as a QR code, to the person whose phone it is.
+That person chooses the password, which so nobody else learns. A code has no right of its own: it
+does what the one who has begun it may do when it is used. Codes are in memory only, as HMACs under
+a key of this process, so that neither the memory nor the time of a look-up tells one.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from appliance.access.tokens import since_start
+from appliance.broker.values import Identity
+
+#: Seconds for which a code can be used.
+LIFETIME: Final = 600.0
+
+#: The most codes of all users; each user has one at most.
+MOST: Final = 64
+
+#: Random bytes of a code.
+_RANDOM: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolment:
+    """Whose password is set, and who has begun it, None for the control socket.
+
+    `groups` are those of a user that is made with it; None for one that is there.
+    """
+
+    username: str
+    groups: tuple[str, ...] | None
+    by: Identity | None
+    ends_at: float
+
+
+class Enrolments:
+    """The codes that can be used now; belongs to the event loop."""
+
+    def __init__(self, clock: Callable[[], float] = since_start) -> None:
+        self._clock = clock
+        self._key = secrets.token_bytes(32)
+        self._pending: dict[bytes, Enrolment] = {}
+
+    def begin(
+        self, username: str, groups: tuple[str, ...] | None, by: Identity | None
+    ) -> str | None:
+        """A new code in the place of an earlier one of this user; None when there are too many."""
+        now = self._clock()
+        self._pending = {
+            key: each
+            for key, each in self._pending.items()
+            if each.ends_at > now and each.username != username
+        }
+        if len(self._pending) >= MOST:
+            return None
+        code = secrets.token_urlsafe(_RANDOM)
+        self.put_back(code, Enrolment(username, groups, by, now + LIFETIME))
+        return code
+
+    def take(self, code: str) -> Enrolment | None:
+        """What the code is for; nobody finds it again. None for a code that is unknown or old."""
+        found = self._pending.pop(self._digest(code), None)
+        return found if found is not None and found.ends_at > self._clock() else None
+
+    def put_back(self, code: str, enrolment: Enrolment) -> None:
+        """Let the code be used: nothing came of it."""
+        self._pending[self._digest(code)] = enrolment
+
+    def _digest(self, code: str) -> bytes:
+        return hmac.digest(self._key, code.encode(), "sha256")

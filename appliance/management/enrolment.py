@@ -1,0 +1,136 @@
+"""The verb `enrol`: a one-time code with which a phone sets its user's password.
+
+A code is worth the right to add that user, or to change its password, and is given to nobody
+without that right. When it is used, the same is asked again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+from urllib.parse import quote
+
+from pydantic import Field
+
+from appliance.access import FileAccess, check_username
+from appliance.access import groups as acl_groups
+from appliance.access.enrolments import LIFETIME, Enrolment, Enrolments
+from appliance.broker.broker import Broker
+from appliance.broker.values import Identity
+from appliance.management.topics import topic_of
+from appliance.management.users import GroupNames, UserName
+from appliance.management.verbs import Arguments, Caller, Verb, Verbs
+from appliance.ros.calls.dispatcher import CallError
+
+#: The most characters of a user's name that the URL says as well, for who looks at it.
+_SHOWN: Final = 60
+
+#: Scheme, host and port of the console, as the phone reaches it.
+Origin = Annotated[str, Field(max_length=300, pattern=r"^https?://[A-Za-z0-9.:\[\]_-]+$")]
+
+
+@dataclass(eq=False)
+class Enrol(Arguments):
+    """A user that is there, or with `groups` a new one; and where its phone finds the console."""
+
+    user: UserName
+    origin: Origin
+    groups: GroupNames | None = None
+
+
+class EnrolmentVerb:
+    """Begins enrolments."""
+
+    def __init__(self, broker: Broker, access: FileAccess, enrolments: Enrolments) -> None:
+        self._broker = broker
+        self._access = access
+        self._enrolments = enrolments
+
+    def verbs(self) -> Iterator[Verb[Any]]:
+        """The verb."""
+        yield Verb("enrol", Enrol, self._begin, changes="enrolment begun", changed=_named)
+
+    async def _begin(self, caller: Caller, wanted: Enrol) -> dict[str, Any]:
+        groups = None if wanted.groups is None else tuple(wanted.groups)
+        if self._access.in_force.users_path is None:
+            raise CallError("rejected", "there is no users file: a plugin knows the users")
+        is_known = self._access.knows(wanted.user)
+        if is_known and groups is not None:
+            raise CallError("rejected", f"there is a user {wanted.user!r} already")
+        if not is_known and groups is None:
+            raise CallError("not_found", f"there is no user {wanted.user!r}")
+        check_right(self._broker, caller.identity, _verb_for(groups))
+        if groups is not None:
+            await self._check_new(wanted.user, groups)
+        code = self._enrolments.begin(wanted.user, groups, caller.identity)
+        if code is None:
+            raise CallError("too_many", "too many enrolments wait for their phones")
+        named = f"/{quote(wanted.user, safe='')}" if len(wanted.user) <= _SHOWN else ""
+        url = f"{wanted.origin}/#/enrol/{code}{named}"
+        return {"user": wanted.user, "url": url, "seconds": round(LIFETIME), "qr": _picture(url)}
+
+    async def _check_new(self, user: str, groups: tuple[str, ...]) -> None:
+        """Raise CallError for what the phone would be refused: its owner could not mend that."""
+        acl = self._access.in_force.acl_path
+        known = [] if acl is None else await asyncio.to_thread(acl_groups.groups, acl)
+        unknown = [name for name in groups if name not in known]
+        if unknown:
+            raise CallError("bad_request", f"there is no group {unknown[0]!r}")
+        try:
+            check_username(user)
+        except ValueError as error:
+            raise CallError("bad_request", str(error)) from None
+
+
+async def carry_out(
+    broker: Broker, verbs: Verbs, enrolment: Enrolment, password: str, address: str
+) -> None:
+    """Set the password, as the one who has begun the enrolment; from the phone's address.
+
+    Raises CallError.
+    """
+    verb = _verb_for(enrolment.groups)
+    check_right(broker, enrolment.by, verb)
+    values: dict[str, Any] = {"user": enrolment.username, "password": password}
+    if enrolment.groups is not None:
+        values["groups"] = list(enrolment.groups)
+    await verbs.run(Caller(enrolment.by, address), verb, values)
+
+
+def check_right(broker: Broker, identity: Identity | None, verb: str) -> None:
+    """Raise CallError where the rules in force do not let it call the verb; the control socket,
+    which has no identity, may."""
+    if identity is None:
+        return
+    decision = broker.router.may_publish(identity, topic_of(verb))
+    if not decision.allowed:
+        raise CallError("not_authorized", f"that takes the right to {verb}: {decision.reason}")
+
+
+def _verb_for(groups: tuple[str, ...] | None) -> str:
+    return "user_password" if groups is None else "user_add"
+
+
+def _picture(url: str) -> dict[str, Any]:
+    """The QR code as the path of an SVG: squares of 1 × 1, without the quiet zone around."""
+    import segno
+
+    code = segno.make(url, micro=False)
+    runs = []
+    for y, row in enumerate(code.matrix):
+        x = 0
+        while x < len(row):
+            width = 1
+            while x + width < len(row) and row[x + width] == row[x]:
+                width += 1
+            if row[x]:
+                runs.append(f"M{x} {y}h{width}v1h-{width}z")
+            x += width
+    return {"size": len(code.matrix), "path": "".join(runs)}
+
+
+def _named(wanted: Enrol) -> dict[str, Any]:
+    groups = {} if wanted.groups is None else {"groups": ", ".join(wanted.groups)}
+    return {"of": wanted.user, **groups}

@@ -1,0 +1,50 @@
+"""Codes of enrolments: each is used once, in time, and they are few."""
+
+from __future__ import annotations
+
+from appliance.access.enrolments import LIFETIME, MOST, Enrolments
+from appliance.broker.values import Identity
+
+ADMIN = Identity("admin", "a")
+
+
+class Clock:
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_code_is_used_once_and_in_time():
+    clock = Clock()
+    enrolments = Enrolments(clock)
+    code = enrolments.begin("bob", ("viewers",), ADMIN)
+    assert code is not None and len(code) == 32  # 192 bits
+    assert code.encode() not in b"".join(enrolments._pending)
+    for wrong in ("", code[:-1], code.upper(), code + "=", "\u202e"):
+        assert enrolments.take(wrong) is None
+    found = enrolments.take(code)
+    assert found is not None
+    assert (found.username, found.groups, found.by) == ("bob", ("viewers",), ADMIN)
+    assert enrolments.take(code) is None
+    enrolments.put_back(code, found)
+    clock.now += LIFETIME - 1
+    assert enrolments.take(code) == found
+    enrolments.put_back(code, found)
+    clock.now += 1
+    assert enrolments.take(code) is None
+
+
+def test_codes_are_bounded():
+    clock = Clock()
+    enrolments = Enrolments(clock)
+    first = enrolments.begin("0", None, None)
+    assert first is not None
+    assert enrolments.begin("0", None, None) not in (None, first)
+    assert enrolments.take(first) is None  # the later one took its place
+    assert all(enrolments.begin(str(number), None, None) for number in range(1, MOST))
+    assert enrolments.begin("one more", None, None) is None
+    assert enrolments.begin("0", None, None) is not None
+    clock.now += LIFETIME
+    assert enrolments.begin("one more", None, None) is not None
+    assert len(enrolments._pending) == 1
