@@ -76,6 +76,16 @@ def join(acl: Path, robot: str, user: str, wanted: Iterable[str]) -> None:
         raise AccessFileError([FileProblem(path, 0, 0, text)]) from error
 
 
+def leave(acl: Path, robot: str, user: str) -> None:
+    """Take the user out of all groups; the file is left alone where it is in none.
+
+    Raises:
+        AccessFileError: the file cannot be read or written.
+    """
+    if user in members(acl):
+        join(acl, robot, user, ())
+
+
 def _with_groups(text: str, user: str, wanted: list[str]) -> str:
     """The rules with these groups for the user, at its first `user` line or at the end."""
     lines = [f"include {FOLDER}/{name}.conf" for name in wanted]

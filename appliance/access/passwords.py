@@ -73,6 +73,8 @@ def check_username(username: str) -> None:
         raise ValueError("a user name must not hold ':', which ends it in the users file")
     if username[0] == "#":
         raise ValueError("a user name must not begin with '#', which begins a comment")
+    if username[0] == "\ufeff":
+        raise ValueError("a user name must not begin with a byte order mark, which nobody sees")
     if username != username.strip():
         raise ValueError("a user name must not begin or end with a space")
     if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in username):

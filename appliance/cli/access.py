@@ -80,14 +80,19 @@ def user_passwd(
 
 @user_app.command("remove")
 def user_remove(name: str, config: ConfigOption = None) -> None:
-    """Remove a user."""
+    """Remove a user, also from its groups."""
+    from appliance.access import groups
+
     settings = load(config)
+    acl = settings.broker.acl
     with _users(settings) as users:
         try:
             users.remove(name)
         except KeyError:
             raise CommandError(_no_user(name, users)) from None
         users.save()
+        if acl.exists():  # plugins may stand in for it
+            groups.leave(acl, settings.robot, name)
     typer.echo(f"user {name} removed")
     _note(settings, "user removed", name)
 

@@ -115,6 +115,8 @@ class UserVerbs:
         def remove(users: Passwords) -> None:
             _known(users, wanted.user)
             users.remove(wanted.user)
+            # A client's certificate may still name the user, or a new one may have its name.
+            self._write_groups(wanted.user, [])
 
         return await self._change(wanted.user, remove)
 
@@ -131,9 +133,10 @@ class UserVerbs:
             if wanted:
                 raise CallError("rejected", "there is no ACL file, and so are no groups")
             return
-        if not wanted and user not in acl_groups.members(rules.acl_path):
-            return
-        acl_groups.join(rules.acl_path, rules.robot, user, wanted)
+        if wanted:
+            acl_groups.join(rules.acl_path, rules.robot, user, wanted)
+        else:
+            acl_groups.leave(rules.acl_path, rules.robot, user)
 
     async def _change(self, user: str, change: Callable[[Passwords], None]) -> dict[str, Any]:
         path = self._access.in_force.users_path

@@ -244,7 +244,8 @@ def test_a_users_file_open_to_others_is_told(
 
 
 @pytest.mark.parametrize(
-    "name", ["", "a:b", "a\nb", "a\x7f", " a", "a ", "#a", "x" * 257, "ä" * 129, "a\u2028b"]
+    "name",
+    ["", "a:b", "a\nb", "a\x7f", " a", "a ", "#a", "x" * 257, "ä" * 129, "a\u2028b", "\ufeffa"],
 )
 def test_user_names_that_the_files_cannot_hold(users_file: Path, name: str) -> None:
     with pytest.raises(ValueError, match="user name"):

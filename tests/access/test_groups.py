@@ -10,7 +10,7 @@ import pytest
 from waiting import PATIENCE
 
 from appliance.access import Acl
-from appliance.access.groups import groups, join, members
+from appliance.access.groups import groups, join, leave, members
 from appliance.access.rewriting import locked
 
 
@@ -30,6 +30,9 @@ def test_groups_of_a_file(tmp_path: Path):
     join(acl, "r2", "x", [])
     join(acl, "r2", "new one", ["b"])
     assert members(acl) == {"y": ["a"], "new one": ["b"]}
+    changed = acl.stat().st_mtime_ns
+    leave(acl, "r2", "x")
+    assert acl.stat().st_mtime_ns == changed  # it was in none
     assert "topic read own" in acl.read_text() and acl.stat().st_mode & 0o777 == 0o640
     assert {rule.user for rule in Acl.load(acl, "r2").rules} == {"x", "y", "new one"}
     before = acl.read_text()

@@ -17,7 +17,7 @@ from command_line import run, set_up
 from waiting import PATIENCE, eventually
 
 from appliance import config
-from appliance.access import Passwords
+from appliance.access import Passwords, groups
 from appliance.cli import connection
 from appliance.cli import main as cli
 from appliance.ops.check import check
@@ -255,7 +255,11 @@ def test_users(
 
     assert run("user", "list") == 0
     assert output.readouterr().out == "alice  argon2id\nbob    argon2id\n"
+    acl = here / "acl.conf"
+    before = groups.members(acl)
+    groups.join(acl, "r2", "bob", ["drivers"])
     assert run("user", "remove", "bob") == 0
+    assert groups.members(acl) == before
     for command in ("remove", "passwd"):
         assert run("user", command, "bob") == 1
         assert "there is no user 'bob' in users.passwd" in output.readouterr().err

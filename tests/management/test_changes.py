@@ -99,3 +99,16 @@ async def test_certificates(tmp_path: Path):
         assert states["phone"] == "revoked"
     finally:
         await site.stop()
+
+
+async def test_a_removed_user_is_in_no_group(site: Site):
+    """A client certificate may name the user still: what it may do then are its own rules."""
+    folder = site.directory / "groups"
+    folder.mkdir()
+    (folder / "drivers.conf").write_text("topic write r2d2/cmd_vel\n")
+    admin = await site.join("a")
+    await admin.call("user_add", {"user": "bob", "password": PASSWORD, "groups": ["drivers"]})
+    drive = {"user": "bob", "topic": "r2d2/cmd_vel"}
+    assert any(each["allowed"] for each in (await admin.call("explain", drive))["verdicts"])
+    await admin.call("user_remove", {"user": "bob"})
+    assert not any(each["allowed"] for each in (await admin.call("explain", drive))["verdicts"])
