@@ -315,6 +315,7 @@ class App:
                 lambda: self._reload if self._status is not None else None,
                 self._lag,
                 self._access.tokens,
+                self.settings.robot,
                 self._tls,
                 self._login,
                 self._pulse,

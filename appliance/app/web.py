@@ -32,6 +32,7 @@ LOCALHOST = "localhost"
 class WebParts(MetricsParts):
     """What the web is about: what the metrics are, and these."""
 
+    robot: str
     tls: TlsContexts | None
     login: LoginPolicy
     pulse: Pulse
@@ -47,7 +48,7 @@ def site(parts: WebParts) -> WebSite:
     login = WebLogin(parts.broker, parts.login, asyncio.get_running_loop().time)
     return WebSite(
         {
-            **Console().resources,
+            **Console(parts.robot).resources,
             "/healthz": healthz(parts.pulse.problem),
             "/readyz": readyz(lambda: _states(parts)),
             "/ca.crt": ca_certificate(tls.authority if tls is not None else bytes),

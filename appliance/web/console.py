@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import hashlib
+import html
 import json
 import re
 from collections.abc import Mapping
@@ -27,6 +28,9 @@ PATH: Final = "/console/"
 
 #: What the page has in place of PATH and the hash.
 _PLACE: Final = b"{{files}}/"
+
+#: And in place of the robot's name.
+_ROBOT: Final = b"{{robot}}"
 
 _PAGE: Final = "index.html"
 
@@ -67,9 +71,10 @@ class _File:
 
 
 class Console:
-    """The console's files, from a folder."""
+    """The console's files, from a folder; the page says which robot it is of."""
 
-    def __init__(self, folder: Path = FILES) -> None:
+    def __init__(self, robot: str, folder: Path = FILES) -> None:
+        self._robot = html.escape(robot).encode()
         self._folder = folder
         self._found: dict[str, _File] | None = None
         self._reading = asyncio.Lock()
@@ -92,7 +97,7 @@ class Console:
         """The files by their paths; read once, and again where that has failed. Raises OSError."""
         async with self._reading:
             if self._found is None:
-                self._found = await asyncio.to_thread(_read, self._folder)
+                self._found = await asyncio.to_thread(_read, self._folder, self._robot)
             return self._found
 
 
@@ -105,7 +110,7 @@ def takes_gzip(accepted: str) -> bool:
     return False
 
 
-def _read(folder: Path) -> dict[str, _File]:
+def _read(folder: Path, robot: bytes) -> dict[str, _File]:
     """All files, by the paths at which they are. Raises OSError."""
     names = sorted(
         path.relative_to(folder).as_posix()
@@ -113,7 +118,7 @@ def _read(folder: Path) -> dict[str, _File]:
         if path.suffix in _TYPES and path.is_file()
     )
     contents = {name: (folder / name).read_bytes() for name in names}
-    page = contents.pop(_PAGE)
+    page = contents.pop(_PAGE).replace(_ROBOT, robot)
     for name, imports in _imports(contents[_MANIFEST]).items():
         contents[name] = _with_paths(contents[name], imports)
     digest = hashlib.sha256()

@@ -33,10 +33,14 @@ user alice
 topic readwrite {robot}/#
 topic read $SYS/#
 topic write $CONTROL/appliance/v1/+/_call/#
+topic read other/#
 
 user viewer
 topic read {robot}/#
 topic write $CONTROL/appliance/v1/rights/_call
+
+user stranger
+topic readwrite other/#
 """
 PASSWORD = "only-to-look-at-1"
 
@@ -85,7 +89,7 @@ def appliance(
     listeners = [{"bind": bind, "tls": True}, {"bind": bind}, secure, web]
     process = ApplianceProcess(
         tmp_path_factory.mktemp("console"),
-        users={"viewer": PASSWORD},
+        users={"viewer": PASSWORD, "stranger": PASSWORD},
         acl=acl,
         broker={"listeners": listeners},
         bridge=bridge,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from appliance_process import ROBOT
 from npm_packages import DIRECTORY, install
 from waiting import PATIENCE
 
@@ -38,7 +39,7 @@ def static_imports(module: str) -> list[str]:
 
 async def test_the_first_page_is_small():
     """All that a browser loads before somebody signs in, and with the connection's program."""
-    console = Console()
+    console = Console(ROBOT)
     page = await get(console, "/")
     taken = {"/": len(page.body)}
     waiting = re.findall(r'(?:href|src)="([^"]+)"', gzip.decompress(page.body).decode())
@@ -64,8 +65,13 @@ async def test_the_first_page_is_small():
     assert sum(taken.values()) + len(worker.body) + len(mqtt.body) <= FIRST_BYTES
 
 
+async def test_the_page_says_which_robot_it_is_of():
+    page = gzip.decompress((await get(Console('r<2>"d2'), "/")).body).decode()
+    assert '<meta name="robot" content="r&lt;2&gt;&quot;d2">' in page
+
+
 async def test_files_are_kept_for_good_and_the_page_is_not():
-    console = Console()
+    console = Console(ROBOT)
     page = await get(console, "/")
     assert page.content_type == "text/html; charset=utf-8"
     assert not any(name == "Cache-Control" for name, _ in page.headers)  # then it is no-store
@@ -90,7 +96,7 @@ async def test_another_content_has_another_path(tmp_path: Path):
         (tmp_path / "vendor").mkdir(exist_ok=True)
         (tmp_path / "vendor/manifest.json").write_text("{}")
         (tmp_path / "index.html").write_text("{{files}}/")
-        return gzip.decompress((await get(Console(tmp_path), "/")).body).decode()
+        return gzip.decompress((await get(Console(ROBOT, tmp_path), "/")).body).decode()
 
     (tmp_path / "a.js").write_text("1")
     first = await path()
@@ -100,7 +106,7 @@ async def test_another_content_has_another_path(tmp_path: Path):
 
 
 async def test_files_that_could_not_be_read_are_read_again(tmp_path: Path):
-    console = Console(tmp_path)
+    console = Console(ROBOT, tmp_path)
     with pytest.raises(KeyError):
         await get(console, "/")
     (tmp_path / "vendor").mkdir()

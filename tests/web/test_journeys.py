@@ -261,7 +261,8 @@ def test_calls_of_the_page_over_a_connection_of_their_own(
     visit: Callable[..., Visit], appliance: ApplianceProcess
 ) -> None:
     """An answer, an error of the appliance, a call without the right, and one after the end."""
-    page = visit(**DESKTOP).sign_in()
+    visited = visit(**DESKTOP)
+    page = visited.sign_in()
     link = page.evaluate(
         "performance.getEntriesByType('resource').map(({ name }) => name)"
         ".find((name) => name.endsWith('/link.js'))"
@@ -283,5 +284,5 @@ def test_calls_of_the_page_over_a_connection_of_their_own(
     assert call("elsewhere/_call") == (
         "This user may not read its answers: pattern read elsewhere/_reply/%c/#"
     )
-    page.evaluate("link => import(link).then(({ signOut }) => signOut())", link)
+    visited.sign_out()
     assert call(verb.format("rights")) == "Nobody is signed in."

@@ -71,8 +71,7 @@ def test_who_signs_out_is_out(visit: Callable[..., Visit], appliance: ApplianceP
     kept = stored(page)
     reload(visited, "nav")
     before = appliance.log.count("token ended")
-    page.click("text=Sign out")
-    page.wait_for_selector("input[name=password]")
+    visited.sign_out()
     eventually(lambda: appliance.log.count("token ended") > before, "the token ends")
     assert page.evaluate(STORED) is None
     reload(visited, "input[name=password]")

@@ -4,7 +4,7 @@
 import { h } from './vendor/preact.mjs'
 import { useEffect, useRef, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
-import { drive, robots, tell } from './link.js'
+import { drive, robot, robots, tell } from './link.js'
 
 const html = htm.bind(h)
 
@@ -12,31 +12,32 @@ const TWIST = /^geometry_msgs(\/msg)?\/Twist(Stamped)?$/
 const CAUTIOUS = { 'linear.x': 0.2, 'angular.z': 0.5 } // m/s and rad/s where the route has no clamp
 const DEAD_MAN = [4, 5] // the gamepad's shoulder buttons
 
-/** The routes that take a Twist, with what speaks against driving by each. */
+/**
+ * The routes that take a Twist, with what speaks against driving by each. Only those of this robot: who
+ * may write another's topics may publish routes there, with rules that they have not.
+ */
 function drivable() {
   const found = []
-  for (const { routes } of robots.value.values()) {
-    for (const route of routes ?? []) {
-      if (route?.direction !== 'to_ros' || !TWIST.test(route.type)) continue
-      const isStamped = route.type.endsWith('Stamped')
-      const rules = route.rules ?? {}
-      let obstacle = ''
-      if (rules.on_silence == null) {
-        obstacle = 'This route has no on_silence in appliance.yaml: the robot would not stop if this device went away.'
-      } else if (route.encoding !== 'json') {
-        obstacle = `This route takes ${route.encoding}; the console drives with JSON.`
-      }
-      const limit = (field) => bounds(rules.clamp, isStamped ? `twist.${field}` : field, CAUTIOUS[field])
-      found.push({
-        mqtt: route.mqtt,
-        isStamped,
-        obstacle,
-        commanding: rules.commanding ?? null,
-        linear: limit('linear.x'),
-        angular: limit('angular.z'),
-        isClamped: Boolean(rules.clamp && Object.keys(rules.clamp).length),
-      })
+  for (const route of robots.value.get(robot)?.routes ?? []) {
+    if (route?.direction !== 'to_ros' || !TWIST.test(route.type)) continue
+    const isStamped = route.type.endsWith('Stamped')
+    const rules = route.rules ?? {}
+    let obstacle = ''
+    if (rules.on_silence == null) {
+      obstacle = 'This route has no on_silence in appliance.yaml: the robot would not stop if this device went away.'
+    } else if (route.encoding !== 'json') {
+      obstacle = `This route takes ${route.encoding}; the console drives with JSON.`
     }
+    const limit = (field) => bounds(rules.clamp, isStamped ? `twist.${field}` : field, CAUTIOUS[field])
+    found.push({
+      mqtt: route.mqtt,
+      isStamped,
+      obstacle,
+      commanding: rules.commanding ?? null,
+      linear: limit('linear.x'),
+      angular: limit('angular.z'),
+      isClamped: Boolean(rules.clamp && Object.keys(rules.clamp).length),
+    })
   }
   return found
 }

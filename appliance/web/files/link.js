@@ -6,11 +6,14 @@ const FRAME = 100 // ms between two questions; the values change twice a second
 
 const STORED = 'console' // what this window keeps of a sign-in: the user and a token, no password
 
-export const session = signal({ name: 'out', reason: '' })
+export const session = signal({ name: 'out', reason: history.state?.reason ?? '' })
+history.replaceState(null, '')
 export const user = signal('')
 export const rows = new Map() // topic → signal of its row
 export const names = signal([]) // all topics, sorted
 export const untold = signal(0)
+/** The name of this robot, as its server says. Others' topics may be anybody's. */
+export const robot = document.querySelector('meta[name=robot]').content
 export const robots = signal(new Map()) // robot → {routes, skipped}
 export const inspected = signal(null)
 export const drive = signal(null)
@@ -66,8 +69,16 @@ async function frame(now) {
 }
 
 function take(told) {
+  const old = session.peek()
+  if (old.name === 'leaving') return
+  if (told.state.name === 'refused') {
+    keep(null)
+    if (old.name === 'in' || old.name === 'lost') {
+      leave(told.state.reason)
+      return
+    }
+  }
   batch(() => {
-    const old = session.peek()
     if (old.name !== told.state.name || old.reason !== told.state.reason) session.value = told.state
     drive.value = told.drive
     if (told.about) {
@@ -80,10 +91,7 @@ function take(told) {
       }
       robots.value = found
     }
-    if (told.state.name === 'out' || told.state.name === 'refused') {
-      forget()
-      keep(null)
-    } else if (told.token !== null && user.peek()) keep(told.token)
+    if (told.token !== null && user.peek()) keep(told.token)
     if (untold.peek() !== told.untold) untold.value = told.untold
     if (!isPaused.peek()) takeRows(told.rows)
     else held.push(...told.rows.slice(0, 1000))
@@ -118,13 +126,12 @@ function takeRows(told) {
   if (isMore) names.value = [...rows.keys()].sort()
 }
 
-function forget() {
-  if (rows.size) {
-    rows.clear()
-    names.value = []
-  }
-  if (robots.peek().size) robots.value = new Map()
-  inspected.value = null
+/** Load the page anew: whoever signs in next finds nothing of this user in its memory. */
+function leave(reason) {
+  session.value = { name: 'leaving', reason }
+  worker.terminate()
+  history.replaceState({ reason }, '', location.pathname)
+  location.reload()
 }
 
 export function focus(topic) {
@@ -195,8 +202,9 @@ function keep(token) {
   }
 }
 
-export function signOut() {
+export async function signOut() {
+  session.value = { name: 'leaving', reason: '' }
   keep(null)
-  user.value = ''
-  tell('signOut')
+  await ask('signOut').catch(() => {})
+  leave('')
 }

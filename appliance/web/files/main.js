@@ -4,7 +4,7 @@ import { h, render } from './vendor/preact.mjs'
 import { useEffect, useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { names, resume, robots, rows, session, signIn, signOut, user } from './link.js'
+import { names, resume, robot, robots, rows, session, signIn, signOut, user } from './link.js'
 
 const html = htm.bind(h)
 
@@ -56,6 +56,7 @@ function Console() {
   const { page, topic } = place.value
   if (page === 'enrol') return html`<${Later} key=${page} page=${page} topic=${topic} />`
   const { name } = session.value
+  if (name === 'leaving') return html`<p role="status">Signing out …</p>`
   return name === 'in' || name === 'lost' ? html`<${Frame} />` : html`<${SignIn} />`
 }
 
@@ -68,7 +69,7 @@ function Frame() {
   }, [page])
   return html`
     <header>
-      <strong class="robot">${robotName()}</strong>
+      <strong class="robot">${robot}</strong>
       <nav aria-label="Pages">${PAGES.map(([key, label]) => html`
         <a href=${`#/${key}`} aria-current=${key === page ? 'page' : null}>${label}</a>`)}</nav>
       <span class="user">${user.value}
@@ -89,11 +90,6 @@ function Later({ page, topic }) {
     )
   }, [page])
   return Page === null ? html`<p class="quiet">…</p>` : html`<${Page} topic=${topic} />`
-}
-
-function robotName() {
-  const found = [...robots.value.keys()]
-  return found.length === 1 ? found[0] : location.hostname
 }
 
 // --- sign in ---------------------------------------------------------------------------------
@@ -118,7 +114,7 @@ function SignIn() {
   }
   const isBusy = name === 'connecting'
   return html`<main class="sign-in">
-    <h1>${location.hostname}</h1>
+    <h1>${robot}</h1>
     <form onSubmit=${submit}>
       <label>User name <input name="user" autocomplete="username" autocapitalize="none"
         spellcheck=${false} required disabled=${!isSafe} /></label>

@@ -12,6 +12,7 @@ const SURVEY_PACKET = 32 * 1024
 const FOCUS_PACKET = 12 * 1024 * 1024
 const MAX_RATE = '2' // messages a second of each topic in the survey
 const TOKEN = 'appliance-token-' // what each begins with
+const LEAVING = 3000 // ms for the token's end; then the page goes
 const WRONG = [0x86, 0x87] // reason codes of a login that is not accepted
 
 let login = null
@@ -158,8 +159,9 @@ async function leave() {
   desk = null
   signOut()
   if (last === null) return
-  const values = { topic: '$CONTROL/appliance/v1/token_end/_call', payload: JSON.stringify({ token }) }
-  last.request(values).catch(() => {}).finally(() => last.stop())
+  const values = { topic: '$CONTROL/appliance/v1/token_end/_call', payload: JSON.stringify({ token }), timeout: LEAVING }
+  await last.request(values).catch(() => {})
+  last.stop()
 }
 
 // --- what a page watches: pictures or a map, over a connection that ends with the page -----------

@@ -1,0 +1,69 @@
+"""What somebody publishes in the name of another robot misleads nobody in the console."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from appliance_process import ROBOT, ApplianceProcess
+from interop.paho_peer import V5, Peer
+from visits import DESKTOP, Visit
+
+pytest.importorskip("rclpy")
+pytest.importorskip("playwright.sync_api")
+
+#: As the appliance describes routes; of the second one it says itself that it has no on_silence.
+FORGED: list[dict[str, Any]] = [
+    {
+        "ros": "/cmd_vel",
+        "mqtt": topic,
+        "direction": "to_ros",
+        "type": "geometry_msgs/msg/Twist",
+        "encoding": "json",
+        "rules": {"on_silence": 0.5, "clamp": {"linear.x": [-9, 9], "angular.z": [-9, 9]}},
+    }
+    for topic in ("other/cmd_vel", f"{ROBOT}/other/cmd_vel")
+]
+
+
+@pytest.fixture
+def stranger(appliance: ApplianceProcess) -> Iterator[Peer]:
+    """It publishes the forged routes, which are there until the end."""
+    with Peer(appliance, V5, user="stranger") as peer:
+        peer.publish("other/_appliance/routes", json.dumps(FORGED), retain=True)
+        yield peer
+        peer.publish("other/_appliance/routes", b"", retain=True)
+
+
+def test_only_this_robot_is_driven(visit: Callable[..., Visit], stranger: Peer) -> None:
+    page = visit(**DESKTOP).sign_in(page="Topics")
+    page.fill("input[type=search]", "other/_app")
+    page.wait_for_selector("text='other/_appliance/routes'")  # it has come, and can be read
+    page.click("nav a:has-text('Drive')")
+    page.wait_for_selector("option >> nth=1", state="attached")
+    topics = page.locator("option").all_inner_texts()
+    assert topics == [f"{ROBOT}/cmd_vel", f"{ROBOT}/other/cmd_vel"]
+    page.select_option("select", topics[1])
+    page.wait_for_selector(".pad[aria-disabled=true]")  # that it has on_silence, a stranger says
+    page.click("nav a:has-text('Overview')")
+    page.wait_for_selector("h2:has-text('other')")  # as what it is, another robot's
+    assert page.inner_text("header .robot") == ROBOT
+
+
+def test_nothing_of_a_user_is_left_for_the_next(visit: Callable[..., Visit]) -> None:
+    """Neither what was shown, nor what waited while it was paused."""
+    visited = visit(**DESKTOP)
+    page = visited.sign_in(page="Topics")
+    page.fill("input[type=search]", "odom")
+    page.click(".list button:has-text('Pause')")
+    page.wait_for_selector(".list button:has-text('Continue')")
+    page.evaluate("globalThis.ofAlice = true")
+    visited.sign_out()
+    page.go_back()
+    page.wait_for_selector("input[name=user]")
+    assert page.evaluate("globalThis.ofAlice") is None
+    visited.sign_in("viewer", page="Topics")
+    page.wait_for_selector(".list button:has-text('Pause')")
+    assert page.input_value("input[type=search]") == ""
