@@ -24,6 +24,7 @@ from waiting import PATIENCE
 
 from appliance import certs
 from appliance.access import Passwords
+from appliance.bench.peers import free_ports as free_ports
 from appliance.ops.init import Credentials, initialise
 
 ROBOT = "r2d2"
@@ -242,11 +243,3 @@ class MosquittoProcess(BrokerProcess):
         except AssertionError:
             self.stop()
             raise
-
-
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [sock.getsockname()[1] for sock in sockets]
-    for sock in sockets:
-        sock.close()
-    return ports

@@ -12,6 +12,7 @@ import base64
 import contextlib
 import hashlib
 import os
+import random
 import secrets
 import shutil
 import socket
@@ -55,6 +56,7 @@ LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or doe
 EXTRA_PATHS = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
 START_SECONDS = 60.0
 STOP_SECONDS = 10.0
+_NOT_OUTGOING = range(20_000, 32_768)  # ports below `net.ipv4.ip_local_port_range` of Linux
 
 
 class PeerError(Exception):
@@ -310,9 +312,18 @@ def last_lines(log: Path) -> str:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 that were free just now, for programs that accept no port 0."""
+    """Ports of 127.0.0.1 that were free just now, for programs that accept no port 0.
+
+    Where port 0 leads, outgoing connections of other programs lead as well, also before the port is
+    used: Linux takes both from 32768 on. These are below.
+    """
+    ports: list[int] = []
     with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [int(each.getsockname()[1]) for each in sockets]
+        for port in random.sample(_NOT_OUTGOING, len(_NOT_OUTGOING)):
+            if len(ports) == count:
+                break
+            each = stack.enter_context(socket.socket())
+            with contextlib.suppress(OSError):
+                each.bind(("127.0.0.1", port))
+                ports.append(port)
+    return ports
