@@ -30,7 +30,7 @@ from appliance.broker.message import OVERHEAD, DelayedMessage, Message
 from appliance.broker.output import CANNOT_KEEP, LONGEST_REASON, Output, in_words
 from appliance.broker.ports import Exchange, Transport
 from appliance.broker.routing import Fanout
-from appliance.broker.session import LARGE_MESSAGE, Session
+from appliance.broker.session import Session
 from appliance.broker.subscribing import AwaitingDecision, Step, answers, subscribe, unsubscribe
 from appliance.broker.values import (
     INSIDE,
@@ -308,16 +308,10 @@ class ClientHandler:
             if route.undecided and self._hold(route, len(payload), self._on_raw_publish, event):
                 return
         targets = route.targets
-        if (
-            first == 0x30
-            and len(payload) <= LARGE_MESSAGE
-            and route.allowed
-            and self.broker.observer is None
-        ):
+        if first == 0x30 and route.allowed and self.broker.observer is None:
             counters.cost += 1 + len(targets)
             # A plain QoS 0 message is forwarded unchanged to receivers of the same version, without
-            # creating a Message. The remaining targets are those that need the slow path, which a
-            # large one does: it waits for its turn where a client is behind.
+            # creating a Message. The remaining targets are those that need the slow path.
             targets = [
                 target
                 for target in targets

@@ -136,7 +136,7 @@ def test_check_of_what_init_made(output: pytest.CaptureFixture[str]) -> None:
     text = output.readouterr().out
     assert "error" not in text
     assert "users: alice" in text
-    assert "rules: 6" in text
+    assert "rules: 8" in text
 
 
 def test_check_changes_nothing(here: Path) -> None:

@@ -18,6 +18,7 @@ from appliance.net.connection import WRITE_PORTION
 
 __all__ = ["event_loop_policy"]
 
+JPEG = {Property.CONTENT_TYPE: "image/jpeg"}  # with properties a message is encoded for each
 RATE = {Property.USER_PROPERTY: [("max-rate", "10")]}
 
 
@@ -71,7 +72,7 @@ async def test_pictures_for_a_viewer_that_does_not_read(harness: Harness, rate: 
     size, most = 1_000_000, 0
     for number in range(90):
         picture = b"%04d" % number + bytes(size)
-        await publisher.send(Publish("camera", picture))
+        await publisher.send(Publish("camera", picture, properties=JPEG))
         packet = await viewer.receive()
         assert isinstance(packet, Publish) and packet.payload == picture
         most = max(most, harness.broker.accounting.queued_bytes)

@@ -261,6 +261,8 @@ def test_the_demo_keeps_its_password_in_a_file(tmp_path: Path) -> None:
         ("/odom", "mqtt"),
         ("/battery", "mqtt"),
         ("/scan", "mqtt"),
+        ("/camera/image_raw", "mqtt"),
+        ("/map", "mqtt"),
         ("/chatter", "mqtt"),
         ("/cmd_vel", "ros"),
     }

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from appliance_process import ROBOT, ApplianceProcess
-from conftest import ACL, BRIDGE
 from interop.paho_peer import V5, Peer
 from visits import DESKTOP, PHONE, Visit
 from waiting import eventually
@@ -21,11 +20,11 @@ BATTERY = f"{ROBOT}/battery"
 
 
 @pytest.fixture(scope="module")
-def bridge() -> dict[str, Any]:
+def bridge(bridge: dict[str, Any]) -> dict[str, Any]:
     return {
-        **BRIDGE,
+        **bridge,
         "topics": [
-            *BRIDGE["topics"],
+            *bridge["topics"],
             {"ros": "/big", "to": "ros", "type": "std_msgs/msg/Int64"},
             {"ros": "/battery", "to": "ros", "type": "sensor_msgs/msg/BatteryState"},
             {"ros": "/nothing", "to": "mqtt", "type": "acme_msgs/msg/Nothing"},
@@ -34,9 +33,9 @@ def bridge() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def acl() -> str:
+def acl(acl: str) -> str:
     """Alice may also say things that an appliance of another name would say."""
-    return ACL.replace("user alice\n", "user alice\ntopic readwrite evil/#\n")
+    return acl.replace("user alice\n", "user alice\ntopic readwrite evil/#\n")
 
 
 def opened(visited: Visit, topic: str, user: str = "alice") -> Any:

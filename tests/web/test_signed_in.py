@@ -35,10 +35,9 @@ def stored(page: Any) -> dict[str, str]:
 
 
 def reload(visited: Visit, place: str) -> None:
-    """Load the page again until that is there. What the old page still asked for is cut off."""
+    """Load the page again until that is there."""
     visited.page.reload()
     visited.page.wait_for_selector(place)
-    visited.wrong = [each for each in visited.wrong if not each.startswith("failed: ")]
 
 
 def test_a_page_that_is_loaded_again_stays_signed_in(

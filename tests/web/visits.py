@@ -25,11 +25,15 @@ class Visit:
         self.wrong: list[str] = []
         self.requests: list[str] = []
         self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.on("requestfailed", lambda request: self.wrong.append(f"failed: {request.url}"))
+        self.page.on("requestfailed", self._failed)
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
         self.page.on("dialog", lambda dialog: (self.wrong.append(dialog.message), dialog.dismiss()))
         self.page.on("console", self._said)
         self.page.goto(origin)
+
+    def _failed(self, request: Any) -> None:
+        if request.failure != "net::ERR_ABORTED":  # what a page that is left still asked for
+            self.wrong.append(f"failed: {request.url} ({request.failure})")
 
     def _said(self, message: Any) -> None:
         if message.type == "error":
@@ -45,11 +49,9 @@ class Visit:
         return self.page
 
     def sign_out(self) -> None:
-        """Return when the page is there anew; what the old one still asked for was cut off."""
-        before = len(self.wrong)
+        """Return when the page is there anew."""
         self.page.click("text='Sign out'")
         self.page.wait_for_selector("input[name=user]")
-        self.wrong[before:] = [w for w in self.wrong[before:] if not w.startswith("failed: ")]
 
     def look(self, name: str) -> None:
         """Have axe look at the page, and keep a picture where that is wanted."""
