@@ -35,6 +35,7 @@ from appliance import config
 from appliance.app import main as app_module
 from appliance.app.main import App
 from appliance.broker.values import Decision
+from appliance.management.verbs import LOCAL
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import (
     Connack,
@@ -59,6 +60,7 @@ from appliance.ops.crash import CrashReports
 from appliance.ops.sd_notify import Notifier
 from appliance.ros import bridge as bridge_module
 from appliance.ros.bridge import Bridge, TopicSettings
+from appliance.ros.calls.dispatcher import CallError
 from appliance.ros.calls.routes import CallRoutes, ParameterSettings, ServiceSettings
 from appliance.ros.node import FakeNode
 from appliance.ros.topics.rules import CommandRules, OnSilence
@@ -761,7 +763,7 @@ async def _browses_slowly(site: Site, patch: pytest.MonkeyPatch) -> None:
     faults = site.faults.count
     await peer.send(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
     await until(
-        lambda: site.scheduler.output > 1 << 20 or site.faults.count > faults, "a slow reader"
+        lambda: site.scheduler.output > 32 << 10 or site.faults.count > faults, "a slow reader"
     )
     peer.writer.transport.resume_reading()
     site.drain(peer)
@@ -847,6 +849,24 @@ async def _bus_lost(site: Site, patch: pytest.MonkeyPatch) -> None:
 @reach("bridge.look", "calls.look")
 async def _looks(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.node.spin()
+
+
+@reach("bridge.live")
+async def _watches(site: Site, patch: pytest.MonkeyPatch) -> None:
+    site.bridge._live._go_on(iter(()), [], site.bridge._session)
+
+
+@reach("schemas.make")
+async def _bridges_another_type(site: Site, patch: pytest.MonkeyPatch) -> None:
+    schemas = site.bridge._schemas
+    schemas.replace(())
+    schemas.replace(("std_msgs/msg/String",))
+
+
+@reach("management.change", "management.changed")
+async def _manages(site: Site, patch: pytest.MonkeyPatch) -> None:
+    with contextlib.suppress(SabotageError, CallError):
+        await site.app._verbs.run(LOCAL, "disconnect", {"client": "nobody"})
 
 
 @reach("actions.look")

@@ -130,18 +130,20 @@ class Output:
         out = self._out
         if not out:
             self._broker.unflushed.append(self)
-        if message.size > LARGE_MESSAGE and self._wait_for_its_turn(
-            message, first, subscription_ids
-        ):
-            return
         if version == 5 and (
             subscription_ids or message.expires_at is not None or self._aliases is not None
         ):
+            if message.size > LARGE_MESSAGE and self._wait_for_its_turn(
+                message, first, subscription_ids
+            ):
+                return
             out.append(self._encode(first, packet_id, message, subscription_ids))
         else:
             if message.wire_key == version << 8 | first:
                 out.append(message.wire_head)
             else:
+                if message.size > LARGE_MESSAGE and self._wait_for_its_turn(message, first, None):
+                    return
                 out.append(self._header_cache.get(message, version, first))
             if qos:
                 out.append(packet_id.to_bytes(2, "big"))

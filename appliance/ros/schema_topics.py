@@ -54,7 +54,7 @@ class SchemaTopics:
         self._missing: dict[str, None] = {}
         #: The bytes of each type's retained schema, 0 where there is none.
         self._sizes: dict[str, int] = {}
-        self._is_working = False
+        self._making: asyncio.Task[None] | None = None
         self._is_full = False
 
     def start(self, session: Session) -> None:
@@ -75,22 +75,18 @@ class SchemaTopics:
             if self._sizes.pop(name):
                 self._publish(self._above + topic_of(name), b"")
         self._missing = {name: None for name in wanted if name not in self._sizes}
-        if self._missing and not self._is_working:
-            self._is_working = True
-            self._entries.task("schemas.make", self._make())
+        if self._missing and (self._making is None or self._making.done()):
+            self._making = self._entries.task("schemas.make", self._make())
 
     async def _make(self) -> None:
-        try:
-            while self._missing and self._session is not None:
-                batch = list(self._missing)[:_BATCH]
-                for name in batch:
-                    del self._missing[name]
-                    self._sizes[name] = 0  # also of one that fails: it would fail again
-                for name, payload in await asyncio.to_thread(self._schemas, batch):
-                    self._take(name, payload)
-                self._broker.flush()
-        finally:
-            self._is_working = False
+        while self._missing and self._session is not None:
+            batch = list(self._missing)[:_BATCH]
+            for name in batch:
+                del self._missing[name]
+                self._sizes[name] = 0  # also of one that fails: it would fail again
+            for name, payload in await asyncio.to_thread(self._schemas, batch):
+                self._take(name, payload)
+            self._broker.flush()
 
     def _schemas(self, names: list[str]) -> list[tuple[str, bytes]]:
         """In a thread: the schemas of those types that can be described."""

@@ -1,4 +1,4 @@
-"""What the demo robot sees; that it publishes it is in tests/web/test_camera.py."""
+"""What the demo robot sees; that it publishes it is in tests/web/test_camera_page.py."""
 
 from __future__ import annotations
 
