@@ -534,9 +534,8 @@ async def _push_forever(load: Load, clients: int, data: bytes, count: int, what:
             while load.on and line.open:
                 await line.push(data)
                 load.counts[what] += count
-                load.counts["pongs"] += line.pongs
-                line.pongs = 0
                 await asyncio.sleep(0)
+            load.counts["pongs"] += line.pongs
 
     await load.together(*(push(number) for number in range(clients)))
     assert load.counts[what]
@@ -596,7 +595,7 @@ async def web_fragments_at_once(load: Load) -> None:
     await _push_at_once(load, [chunk], 0.3, frame(b"", BINARY, last=False))
 
 
-@attack(rf"{CLIENT}", at_least=2.0, **WEB)
+@attack(rf"{CLIENT}", at_least=4.0, **WEB)
 async def web_pings(load: Load) -> None:
     """Twenty clients that send pings, empty ones and the largest, as fast as they are read."""
     data = frame(b"", PING) * 5000 + frame(bytes(125), PING) * 500
