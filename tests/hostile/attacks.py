@@ -531,11 +531,13 @@ async def _push_forever(load: Load, clients: int, data: bytes, count: int, what:
     async def push(number: int) -> None:
         async for turn in load.rounds(0.02):
             line = await _web(load, f"web-{number}-{turn}")
-            while load.on and line.open:
-                await line.push(data)
-                load.counts[what] += count
-                await asyncio.sleep(0)
-            load.counts["pongs"] += line.pongs
+            try:
+                while load.on and line.open:
+                    await line.push(data)
+                    load.counts[what] += count
+                    await asyncio.sleep(0)
+            finally:
+                load.counts["pongs"] += line.pongs
 
     await load.together(*(push(number) for number in range(clients)))
     assert load.counts[what]
