@@ -62,9 +62,11 @@ def test_disconnect_a_client(visit: Callable[..., Visit], appliance: AppliancePr
         page.wait_for_selector(f".filter:text-is('{ROBOT}/#')")
         visited.look("desktop-client")
         page.click("button:has-text('Disconnect …')")
+        page.wait_for_selector("dialog[open]")
         page.keyboard.press("Escape")
+        page.wait_for_selector("dialog", state="detached")
         page.click("button:has-text('Disconnect …')")
-        assert page.evaluate("document.activeElement.textContent") == "Cancel"
+        page.wait_for_selector("dialog button:focus:text-is('Cancel')")
         visited.look("desktop-client-asked")
         page.click("dialog .danger")
         code = tablet.disconnected.get(timeout=PATIENCE)
