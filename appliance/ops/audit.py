@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 QUEUE_LIMIT: Final = 10_000
 
 #: The rate limit: events of one kind from one source (an address or a user) that are written in an
-#: interval, and its seconds. More are counted.
+#: interval, and its seconds. More are counted. A change by a client is of a kind by what it was.
 BURST: Final = 100
 INTERVAL: Final = 10.0
 #: Kinds and sources that the rate limit remembers; beyond that it evicts the least recent.
@@ -52,6 +52,9 @@ CLOSE_TIMEOUT: Final = 2.0
 
 #: The keys and values of one line, in their order.
 Fields: TypeAlias = dict[str, Any]
+
+#: What the rate limit counts together: the event, of a change what it was, and the address or user.
+_Source: TypeAlias = tuple[str, str, str]
 
 
 class AuditError(ValueError):
@@ -87,7 +90,7 @@ class Audit:
         self._lost = 0  # lines that are missing in the file, which does not say so yet
         self._is_failing = False
         self._is_closing = threading.Event()
-        self._floods: OrderedDict[tuple[str, str], _Flood] = OrderedDict()
+        self._floods: OrderedDict[_Source, _Flood] = OrderedDict()
         self._thread = threading.Thread(target=self._write_all, name="audit", daemon=True)
         self._thread.start()
 
@@ -183,11 +186,9 @@ class Audit:
 
     def _admit(self, event: Fields, now: float) -> list[Fields]:
         """The lines to write for an event: none when its source has reached the rate limit."""
-        if event["event"] in ("changed", "started", "stopped"):
+        source = _source(event)
+        if source is None:
             return [event]
-        # Clients choose their ids, so without an address the source is the user.
-        origin = event["address"].rpartition(":")[0] if "address" in event else event["user"]
-        source = event["event"], origin or ""
         flood = self._floods.get(source)
         written: list[Fields] = []
         if flood is None or now - flood.since >= INTERVAL:
@@ -372,10 +373,26 @@ def _code(code: int) -> Fields:
     return {"code": f"0x{code:02X} {name}"}
 
 
-def _summary(source: tuple[str, str], flood: _Flood) -> list[Fields]:
+def _source(event: Fields) -> _Source | None:
+    """What the event is counted with in the rate limit; None if there is no limit.
+
+    Changes by clients are counted by what they did and whether it was done, so that many of a kind
+    hide none of another. All others are few: this computer's own, or consequences of those.
+    """
+    by = event.get("by")
+    if isinstance(by, dict):
+        return event["event"], event["what"], by["user"] or ""
+    if event["event"] in ("changed", "started", "stopped"):
+        return None
+    # Clients choose their ids, so without an address the source is the user.
+    origin = event["address"].rpartition(":")[0] if "address" in event else event["user"]
+    return event["event"], "", origin or ""
+
+
+def _summary(source: _Source, flood: _Flood) -> list[Fields]:
     if not flood.suppressed:
         return []
-    event, origin = source
+    event, _, origin = source
     more = {"time": _now(), "event": "more", "of": event, "from": origin}
     return [{**more, "count": flood.suppressed, "last": flood.last}]
 

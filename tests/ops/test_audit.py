@@ -167,6 +167,29 @@ def test_a_flood_is_told_in_part_and_counted(tmp_path: Path) -> None:
     assert len(events(path, "changed")) == 1
 
 
+def test_a_flood_of_changes_is_told_in_part_and_hides_no_others(tmp_path: Path) -> None:
+    path = tmp_path / "audit.log"
+    mallory, alice = ({"client": name, "user": name} for name in ("mallory", "alice"))
+    with open_audit(path) as audit:
+        for number in range(2000):
+            who = {"client": f"c{number}", "user": "mallory"}
+            audit.changed(
+                "client disconnected", id=str(number), by=who, address=f"10.0.0.1:{number}"
+            )
+            time.sleep(0 if number % 100 else 0.002)
+        audit.changed("user added", of="eve", by=mallory, address="10.0.0.1:1")
+        audit.changed("client disconnected", id="x", by=alice, address="10.0.0.1:2")
+        audit.changed("client disconnected", id="y", by="the control socket")
+        audit.changed("users and access rules", users_added=["eve"])
+    told = events(path, "changed")
+    assert len(told) == audit_module.BURST + 4
+    assert [entry.get("by") for entry in told[-4:]] == [mallory, alice, "the control socket", None]
+    (more,) = events(path, "more")
+    assert (more["of"], more["from"]) == ("changed", "mallory")
+    assert more["count"] == 2000 - audit_module.BURST
+    assert (more["last"]["what"], more["last"]["id"]) == ("client disconnected", "1999")
+
+
 def test_what_waits_is_bounded_and_what_is_lost_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
