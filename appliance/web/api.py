@@ -124,7 +124,7 @@ class Api:
             wanted = await _body(request)
             topic = _topic(wanted)
             timeout = _take(wanted, "timeout", (int, float), TIMEOUT)
-            payload = orjson.dumps(wanted.pop("payload", {}))
+            payload = _as_json(wanted.pop("payload", {}))
             _no_more(wanted)
             if not 0 < timeout <= LONGEST_TIMEOUT:
                 raise HttpError(400, f"timeout: up to {LONGEST_TIMEOUT:g} s")
@@ -207,7 +207,7 @@ def _message(wanted: dict[str, Any]) -> Publish:
     if ("payload" in wanted) is ("base64" in wanted):
         raise HttpError(400, "either payload, which is sent as JSON, or base64, for bytes")
     if "payload" in wanted:
-        payload = orjson.dumps(wanted.pop("payload"))
+        payload = _as_json(wanted.pop("payload"))
         content_type = content_type or JSON
     else:
         try:
@@ -225,6 +225,14 @@ def _message(wanted: dict[str, Any]) -> Publish:
     if sent_at is not None:
         properties[Property.USER_PROPERTY] = [("sent-at", _text("sent_at", str(sent_at)))]
     return Publish(topic, payload, qos, retain, properties=properties or None)
+
+
+def _as_json(payload: object) -> bytes:
+    """The payload as it is sent. Raises HttpError."""
+    try:
+        return orjson.dumps(payload)
+    except TypeError as error:  # orjson reads what is nested more deeply than it writes
+        raise HttpError(400, f"payload: {error}") from None
 
 
 def _topic(wanted: dict[str, Any]) -> str:

@@ -92,7 +92,7 @@ class CarriedClient:
         self._writer.close()
 
     async def publish(self, message: Publish) -> None:
-        """Publish a message with QoS 0 or 1; of QoS 0 nobody says whether it was taken."""
+        """Publish a message with QoS 0 or 1; of QoS 0 nobody says that it was taken."""
         if message.qos:
             await self._send(replace(message, packet_id=next(self._packet_ids)))
             puback = await self._next(Puback)
@@ -102,7 +102,7 @@ class CarriedClient:
             return
         await self._send(message, Disconnect())
         with contextlib.suppress(EOFError, asyncio.TimeoutError):
-            await asyncio.wait_for(self._next(Disconnect), GOODBYE)
+            await asyncio.wait_for(self._next(Puback), GOODBYE)  # none comes: to the end
 
     async def call(self, topic: str, payload: bytes, content_type: str) -> Publish:
         """The answer to a call of a service, an action or a verb; the caller limits the time."""
@@ -124,7 +124,8 @@ class CarriedClient:
 
     async def _send(self, *packets: Packet) -> None:
         self._writer.write(b"".join(packet.encode(V5) for packet in packets))
-        await self._writer.drain()
+        with contextlib.suppress(ConnectionError):  # what was sent before its end says why
+            await self._writer.drain()
 
     async def _next(self, kind: type[P]) -> P:
         """The next packet of this kind. EOFError when the connection ends."""

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import json
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Subscription
+from appliance.mqtt.reason import ReasonCode
 from appliance.web import api
 
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -237,6 +239,41 @@ async def test_bad_bodies(web: WebApp):
         assert (headers.get("connection") == "close") is (status == 413), name
     assert not messages
     assert (await post(web, "publish", GOOD))[0] == 200
+
+
+async def test_json_that_is_nested_deeply(web: WebApp):
+    """What can be read cannot always be written again."""
+    body = b'{"topic": "r2d2/a", "payload": %s%s}' % (b"[" * 600, b"]" * 600)
+    for path in ("publish", "call"):
+        assert (await post(web, path, body))[0] == 400
+
+
+async def test_a_message_larger_than_a_packet_may_be(web: WebApp):
+    limits = web.app.broker.limits
+    web.app.broker.use(replace(limits, packet_size=4096), web.app.broker.features)
+    for qos in (0, 1):
+        for size in (5_000, 900_000):
+            body = {"topic": "r2d2/a", "payload": "x" * size, "qos": qos}
+            assert (await post(web, "publish", body))[0] == 413, (qos, size)
+    assert (await post(web, "publish", GOOD))[0] == 200
+
+
+async def test_a_client_that_is_ended_while_its_body_comes(web: WebApp):
+    assert (await post(web, "publish", GOOD))[0] == 200  # its password is known from now on
+    await until(lambda: not web.app.broker.clients, "the client to leave")
+    peer = await web.dial()
+    body = json.dumps({**GOOD, "payload": "x" * 100_000}).encode()
+    fields = {**basic(), "Content-Type": "application/json", "Content-Length": str(len(body))}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    await peer.send(f"POST /api/v1/publish HTTP/1.1\r\nHost: localhost\r\n{lines}\r\n".encode())
+    await until(lambda: web.app.broker.clients, "the client to come")
+    for session in list(web.app.broker.sessions.values()):
+        if not session.is_inside:
+            session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "ended")
+    web.app.broker.flush()
+    await until(lambda: not web.app.broker.clients, "the client to leave")
+    await peer.send(body)
+    assert (await answer(peer))[0] == 503
 
 
 async def test_bad_calls(web: WebApp):
