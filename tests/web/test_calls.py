@@ -96,9 +96,8 @@ def test_goals(visit: Callable[..., Visit], robot: Robot) -> None:
     page.wait_for_selector(f"{running} p:has-text('Hz')")
     visited.look("desktop-calls-2-goal")
 
-    page.reload()
-    page.wait_for_selector("form")
-    page = opened(visited, "/turtle/walk")
+    page.reload()  # it stays signed in, and where it was
+    page.wait_for_selector("h2:has-text('/turtle/walk')")
     page.wait_for_selector(f"{running} [aria-label=Feedback]")
     wait_for_change(page, f"{running} [aria-label=Feedback]")
     page.wait_for_selector(".call:has(strong:text-is('succeeded')) [aria-label=Result]")
