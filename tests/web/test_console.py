@@ -168,7 +168,9 @@ def test_a_module_has_no_error_of_syntax(name: str):
     assert done.returncode == 0, done.stderr.decode()
 
 
-@pytest.mark.parametrize("name", ["bounds", "formats", "camera", "map", "calls", "schema"])
+@pytest.mark.parametrize(
+    "name", ["bounds", "formats", "camera", "map", "calls", "schema", "signing"]
+)
 def test_hostile_payloads(name: str):
     """What reads payloads, in node: exact, bounded, and no key becomes one of an object."""
     install()

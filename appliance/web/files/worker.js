@@ -14,6 +14,8 @@ const MAX_RATE = '2' // messages a second of each topic in the survey
 const TOKEN = 'appliance-token-' // what each begins with
 const LEAVING = 3000 // ms for the token's end; then the page goes
 const WRONG = [0x86, 0x87] // reason codes of a login that is not accepted
+const LATER = [0x88, 0x89, 0x97, 0x9f] // and of one that may be, with the same password, after a while
+const NO_ROOM = 'The robot has no room now; trying again.'
 
 let login = null
 let survey = null
@@ -121,7 +123,9 @@ function signIn({ url, user, password, token }) {
     if (client !== survey) return
     const code = error.code
     const isRefused = typeof code === 'number' && code > 0
-    if (isRefused && state.name !== 'in') {
+    if (LATER.includes(code) && (state.name === 'lost' || login.password === undefined)) {
+      if (state.name === 'connecting') state.reason = NO_ROOM
+    } else if (isRefused && state.name !== 'in') {
       const bad = WRONG.includes(code)
       if (bad && client.options.password !== login.password) return // it tries with the password
       end({ name: 'refused', reason: bad ? 'User name or password is wrong.' : String(error.message) })
@@ -132,7 +136,7 @@ function signIn({ url, user, password, token }) {
   client.on('close', () => {
     if (client !== survey) return
     if (state.name === 'in') state = { name: 'lost', reason: 'The connection is lost; trying again.' }
-    else if (state.name === 'connecting') end({ name: 'failed', reason: 'No connection.' })
+    else if (state.name === 'connecting' && state.reason !== NO_ROOM) end({ name: 'failed', reason: 'No connection.' })
   })
 }
 
