@@ -77,5 +77,13 @@ const client = await signIn(TOKEN)
 client.emit('close')
 assert.deepEqual(await state(), { name: 'failed', reason: 'No connection.' })
 
+// What a page asks for as soon as it is there is not lost, however far the robot is.
+const far = await signIn(TOKEN)
+far.subscribe = () => {}
+far.emit('connect')
+assert.equal((await state()).name, 'in')
+await ask('focus', { topic: 'a' })
+assert.equal((await ask('frame')).focus?.topic, 'a')
+
 console.log('ok')
 process.exit()

@@ -107,8 +107,6 @@ function signIn({ url, user, password, token }) {
   client.on('connect', async () => {
     if (client !== survey) return
     state = { name: 'in', reason: '' }
-    const granted = await subscribe(client, ['#', '$SYS/#'], MAX_RATE)
-    if (client === survey && granted[0] >= 0x80) state.reason = 'This user may read no topic.'
     focus ??= new Focus(() => open({}, FOCUS_PACKET), takeAbout)
     if (shelf === null) {
       shelf = new Shelf(focus.client)
@@ -116,7 +114,9 @@ function signIn({ url, user, password, token }) {
     }
     drive ??= new Drive((more) => open(more, SURVEY_PACKET))
     drive.again()
-    if (client === survey && !login.token) stay()
+    if (!login.token) stay()
+    const granted = await subscribe(client, ['#', '$SYS/#'], MAX_RATE)
+    if (client === survey && granted[0] >= 0x80) state.reason = 'This user may read no topic.'
   })
   client.on('message', (topic, buffer, packet) => newest.take(topic, buffer, packet))
   client.on('error', (error) => {
