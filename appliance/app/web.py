@@ -16,6 +16,7 @@ from appliance.management.topics import topic_of
 from appliance.management.verbs import Verbs
 from appliance.net.listeners import Listeners
 from appliance.ops.watchdog import Pulse
+from appliance.ros.payload.cost import json_cost
 from appliance.web.api import Api
 from appliance.web.authority import ca_certificate
 from appliance.web.console import Console
@@ -53,7 +54,7 @@ def site(parts: WebParts) -> WebSite:
             "/readyz": readyz(lambda: _states(parts)),
             "/ca.crt": ca_certificate(tls.authority if tls is not None else bytes),
             "/metrics": metrics(login, Metrics(parts).render),
-            **Api(parts.listeners.carry, is_token, topic_of).resources,
+            **Api(parts.listeners.carry, is_token, topic_of, json_cost).resources,
             "/enrol": enrol(
                 EnrolmentParts(
                     parts.broker,

@@ -38,6 +38,10 @@ LONGEST: Final = 64 * 1024
 #: The most bytes of an answer: of some thousand routes or users.
 LONGEST_ANSWER: Final = 1024 * 1024
 
+#: The most work that the values of a call may be (`ros/payload/cost.py`), a millisecond: everybody
+#: waits while they are checked. 200 questions about rights are half of it.
+MOST_VALUES: Final = 10_000
+
 #: The endpoints limit the size, as these are no messages for ROS.
 _ANY_SIZE: Final = 1 << 28
 
@@ -114,7 +118,10 @@ def _caller(session: Session) -> Caller:
 def _decoded(call: Call) -> Any:
     if not call.payload:
         return {}
+    encoding = VALUE_ENCODINGS[call.encoding]
+    if encoding.cost(call.payload, MOST_VALUES) > MOST_VALUES:
+        raise CallError("too_large", "the call has too many values")
     try:
-        return VALUE_ENCODINGS[call.encoding].loads(call.payload)
+        return encoding.loads(call.payload)
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None

@@ -60,6 +60,9 @@ BODY_PER_COST_UNIT = 16 * 1024
 #: is the site's own memory, the same for all who are sent the same.
 BODY_PORTION = 64 * 1024
 
+#: The most lines of a request's head: each takes microseconds, however short it is.
+HEAD_LINES = 128
+
 #: Empty lines that a client may send before a request (RFC 9112, section 2.2), in bytes.
 EMPTY_LINES = 64
 
@@ -282,6 +285,8 @@ class HttpLayer(MiddleLayer):
             self._protocol.close()
         elif end > HEAD_LIMIT or (end < 4 and len(received) > HEAD_LIMIT):
             self._refuse(431, f"the request's head is longer than {HEAD_LIMIT} bytes")
+        elif received.count(b"\n", 0, max(end, 0)) > HEAD_LINES:
+            self._refuse(431, f"the request's head has more than {HEAD_LINES} lines")
         elif end >= 4:
             head = bytes(received[:end])
             del received[:end]

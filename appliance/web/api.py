@@ -30,6 +30,10 @@ PATH: Final = "/api/v1"
 #: The most bytes of a body: larger messages are for MQTT, which takes them in portions.
 LONGEST: Final = 1024 * 1024
 
+#: The most work that the values of a body may be, in the unit of `Cost`: of lists and objects a few
+#: bytes are as much as a hundred of text, and everybody waits while they are read.
+MOST_VALUES: Final = 100_000
+
 #: Seconds for a call, and the most that may be asked for.
 TIMEOUT: Final = 10.0
 LONGEST_TIMEOUT: Final = 60.0
@@ -77,14 +81,23 @@ Carry: TypeAlias = Callable[
     [str, str, "ssl.SSLObject | None", "bool | None"], "socket.socket | None"
 ]
 
+#: The work of a JSON text by its values, or any number above the most that it may be: a number is
+#: 1, some 0.1 µs, a text, a list or an object is 8.
+Cost: TypeAlias = Callable[[bytes, int], int]
+
 
 class Api:
     """The resources below `/api/v1`."""
 
     def __init__(
-        self, carry: Carry, is_token: Callable[[bytes], bool], topic_of: Callable[[str], str]
+        self,
+        carry: Carry,
+        is_token: Callable[[bytes], bool],
+        topic_of: Callable[[str], str],
+        cost: Cost,
     ) -> None:
         """`topic_of` is where a verb is called."""
+        self._cost = cost
         self._carry = carry
         self._is_token = is_token
         self._topic_of = topic_of
@@ -110,7 +123,7 @@ class Api:
 
     async def _publish(self, request: HttpRequest) -> HttpResponse:
         async def publish(client: CarriedClient) -> HttpResponse:
-            message = _message(await _body(request))
+            message = _message(await self._body(request))
             await client.publish(message)
             if not message.qos:
                 return _json(202, {"code": 0, "reason": "sent"})
@@ -121,7 +134,7 @@ class Api:
 
     async def _call(self, request: HttpRequest) -> HttpResponse:
         async def call(client: CarriedClient) -> HttpResponse:
-            wanted = await _body(request)
+            wanted = await self._body(request)
             topic = _topic(wanted)
             timeout = _take(wanted, "timeout", (int, float), TIMEOUT)
             payload = _as_json(wanted.pop("payload", {}))
@@ -131,6 +144,23 @@ class Api:
             return await _called(client, topic, payload, timeout)
 
         return await self._carried(request, call)
+
+    async def _body(self, request: HttpRequest) -> dict[str, Any]:
+        """The body, an object in JSON. Raises HttpError."""
+        content_type = (request.get("content-type") or "").partition(";")[0].strip().lower()
+        if content_type != JSON:
+            raise HttpError(415, f"the body is {JSON}, and its Content-Type says so")
+        body = await request.body(LONGEST)
+        request.allow(2 * LONGEST_ANSWER)
+        if self._cost(body, MOST_VALUES) > MOST_VALUES:
+            raise HttpError(413, "the body has too many values; base64, or MQTT, takes more")
+        try:
+            found = orjson.loads(body)
+        except ValueError as error:
+            raise HttpError(400, f"the body is not JSON: {str(error)[:200]}") from None
+        if not isinstance(found, dict):
+            raise HttpError(400, "the body is an object in JSON")
+        return found
 
     async def _carried(
         self, request: HttpRequest, work: Callable[[CarriedClient], Any]
@@ -176,22 +206,6 @@ async def _called(
     except (ValueError, LookupError, TypeError):
         code = ""
     return HttpResponse(_CALL_STATUS.get(code, 502), answer.payload, JSON)
-
-
-async def _body(request: HttpRequest) -> dict[str, Any]:
-    """The body, an object in JSON. Raises HttpError."""
-    content_type = (request.get("content-type") or "").partition(";")[0].strip().lower()
-    if content_type != JSON:
-        raise HttpError(415, f"the body is {JSON}, and its Content-Type says so")
-    body = await request.body(LONGEST)
-    request.allow(2 * LONGEST_ANSWER)
-    try:
-        found = orjson.loads(body)
-    except ValueError as error:
-        raise HttpError(400, f"the body is not JSON: {str(error)[:200]}") from None
-    if not isinstance(found, dict):
-        raise HttpError(400, "the body is an object in JSON")
-    return found
 
 
 def _message(wanted: dict[str, Any]) -> Publish:

@@ -46,6 +46,9 @@ _TYPES: Final = {
     ".txt": "text/plain; charset=utf-8",
 }
 
+#: The most characters of an Accept-Encoding: a browser sends thirty.
+_LONGEST_ACCEPTED: Final = 256
+
 #: For a year, and not asked about meanwhile (RFC 8246).
 _FOR_GOOD: Final = ("Cache-Control", "public, max-age=31536000, immutable")
 
@@ -102,7 +105,12 @@ class Console:
 
 
 def takes_gzip(accepted: str) -> bool:
-    """Whether an Accept-Encoding allows gzip (RFC 9110, section 12.5.3)."""
+    """Whether an Accept-Encoding allows gzip (RFC 9110, section 12.5.3).
+
+    Strangers send it, so a long one is not read.
+    """
+    if len(accepted) > _LONGEST_ACCEPTED:
+        return False
     for part in accepted.lower().split(","):
         name, *parameters = (word.strip() for word in part.split(";"))
         if name in ("gzip", "x-gzip", "*"):

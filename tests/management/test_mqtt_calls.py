@@ -193,7 +193,7 @@ BAD = [
     ("clients", {"x" * 60_000: 1}, "Unexpected keyword argument"),
     ("disconnect", {}, "'client': Field required"),
     ("disconnect", {"client": None}, "'client'"),
-    ("clients", b"[" * 60_000, "not JSON"),
+    ("clients", b"[" * 1_000, "not JSON"),
     ("rights", {"questions": [{"action": "publish", "topic": "a/#"}]}, "'a/#'"),
     ("rights", {"questions": [{"action": "subscribe", "topic": "a/#/b"}]}, "a/#/b"),
     ("rights", {"questions": [{"action": "fly", "topic": "a"}]}, "questions.0.action"),
@@ -223,6 +223,9 @@ async def test_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     admin = await site.join("a")
     with pytest.raises(CallError, match=f"takes {LONGEST} at most") as refused:
         await admin.call("clients", b" " * (LONGEST + 1))
+    assert refused.value.code == "too_large"
+    with pytest.raises(CallError, match="too many values") as refused:
+        await admin.call("rights", b'{"questions": [%s[]]}' % (b"[]," * 20_000))
     assert refused.value.code == "too_large"
     await admin.listen("status")
     for _ in range(LIMITS.client + 1):

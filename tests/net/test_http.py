@@ -163,6 +163,7 @@ BAD: dict[str, tuple[bytes, int | None]] = {
     ),
     "a huge header": (GET[:-2] + b"X: " + b"x" * HEAD_LIMIT + b"\r\n\r\n", 431),
     "many headers": (GET[:-2] + b"X: x\r\n" * 4000 + b"\r\n", 431),
+    "many short headers": (GET[:-2] + b"a:\r\n" * 4000 + b"\r\n", 431),
     "an endless head": (b"GET /" + b"x" * 3 * HEAD_LIMIT, 431),
     "no path": (b"GET small HTTP/1.1\r\nHost: localhost\r\n\r\n", 400),
     "a proxy's": (b"CONNECT localhost:1 HTTP/1.1\r\nHost: localhost:1\r\n\r\n", 400),

@@ -78,7 +78,9 @@ async def test_files_are_kept_for_good_and_the_page_is_not():
     text = gzip.decompress(page.body).decode()
     style = re.search(r'href="([^"]+style\.css)"', text)
     assert style is not None
-    for accepted in ("gzip", "", "identity", "gzip;q=0", "br, gzip;q=0.5"):
+    long = "," * 1000 + "gzip"  # a stranger's, and work for each comma
+    assert takes_gzip("gzip, deflate, br, zstd") and not takes_gzip(long)
+    for accepted in ("gzip", "", "identity", "gzip;q=0", "br, gzip;q=0.5", long):
         file = await get(console, style[1], accepted)
         headers = dict(file.headers)
         assert headers["Cache-Control"].endswith("immutable") and "Vary" in headers

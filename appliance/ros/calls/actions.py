@@ -598,7 +598,8 @@ class BridgedAction:
     # Cancelling
 
     def _on_cancel(self, call: Call) -> Callable[[], Awaitable[Answer]]:
-        id_, stamp = goals.which(self._converters, call.payload, call.encoding)
+        limits = self._dispatcher.limits.input
+        id_, stamp = goals.which(self._converters, call.payload, call.encoding, limits)
         self._check_right(call.caller, id_)
         if not self.is_available:
             raise CallError("unavailable", f"there is no action {self.ros} on the bus")

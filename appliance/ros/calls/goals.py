@@ -18,6 +18,8 @@ from appliance.ros.payload.converter import ConversionError, Converters
 from appliance.ros.payload.definitions import Serialization
 from appliance.ros.payload.encodings.base import EncodingName
 from appliance.ros.payload.encodings.registry import RAW, VALUE_ENCODINGS
+from appliance.ros.payload.fallback import TooLargeError
+from appliance.ros.payload.payloads import InputLimits
 
 CANCEL = "action_msgs/srv/CancelGoal"
 GOAL_INFO = "action_msgs/msg/GoalInfo"
@@ -112,7 +114,7 @@ def running(converters: Converters, cdr: bytes) -> list[bytes]:
 
 
 def which(
-    converters: Converters, payload: bytes, encoding: EncodingName
+    converters: Converters, payload: bytes, encoding: EncodingName, limits: InputLimits
 ) -> tuple[bytes, dict[str, int]]:
     """The goals that a call of `_cancel` names: the id of one; or ALL with a time, for those that
     were accepted up to then, and with the time 0 for all. Raises CallError.
@@ -126,6 +128,7 @@ def which(
             goal_info = info.to_dict(payload)
             id_: object = id_of(goal_info["goal_id"])
         else:
+            limits.check(payload, VALUE_ENCODINGS[encoding])
             value = VALUE_ENCODINGS[encoding].loads(payload)
             if value == {"all": True}:
                 value = {"stamp": {}}
@@ -135,6 +138,8 @@ def which(
             if isinstance(id_, str):
                 id_ = binascii.unhexlify(id_.replace("-", ""))
             goal_info = info.to_dict(info.from_dict({"stamp": value.get("stamp", {})}))
+    except TooLargeError as error:
+        raise CallError("too_large", str(error)) from None
     except ConversionError as error:
         raise CallError("bad_request", str(error)) from None
     except ValueError:

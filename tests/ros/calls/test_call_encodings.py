@@ -416,6 +416,8 @@ async def test_cancelling_all_and_all_before_a_time(harness):
         assert (await client.error(STOP, payload))[0] == "bad_request", payload
     for payload in ({"stamp": 7}, {"stamp": {"sec": "x"}}, {"all": True, "goal_id": NONE}):
         assert (await client.error(STOP, payload))[0] == "bad_request", payload
+    work = {"all": [[]] * 20_000}  # for the time of which everybody would wait
+    assert (await client.error(STOP, work))[0] == "too_large"
     assert walks.cancelled == []
 
 
