@@ -32,7 +32,7 @@ assert.deepEqual([newest.rows().length, newest.rows().length, newest.rows().leng
 
 // The history of the topic that is looked at.
 const client = { connected: false, on() {}, end() {} }
-const focus = new Focus(() => client, () => {})
+const focus = new Focus(() => client, null)
 focus.look('t', null)
 for (let n = 0; n < 100; n += 1) focus.take(payload, packet(1024 * KIB), n)
 assert.ok(focus.bytes <= 16 * KIB * KIB && focus.history.length === 16, `${focus.history.length}`)

@@ -32,7 +32,7 @@ function ask(call, values) {
 
 async function signIn(secret) {
   clients.length = 0
-  await ask('signIn', { url: 'wss://robot/mqtt', user: 'alice', ...secret })
+  await ask('signIn', { url: 'wss://robot/mqtt', user: 'alice', robot: 'robot', ...secret })
   const [client] = clients
   client.options.transformWsUrl('', null, client)
   return client

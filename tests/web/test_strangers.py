@@ -67,3 +67,18 @@ def test_nothing_of_a_user_is_left_for_the_next(visit: Callable[..., Visit]) -> 
     visited.sign_in("viewer", page="Topics")
     page.wait_for_selector(".list button:has-text('Pause')")
     assert page.input_value("input[type=search]") == ""
+
+
+def test_a_filter_is_not_a_topic(visit: Callable[..., Visit]) -> None:
+    """A link must not make a page subscribe to everything at the rate of one topic."""
+    page = visit(**DESKTOP).sign_in()
+    for place in ("topics/%23", "topics/a%2F%2B", "camera/%23", "publish/%23", "topics/%00"):
+        page.evaluate(f"location.hash = '#/{place}'")
+        page.wait_for_selector("main > .notice:has-text('not the name of a topic')")
+        page.click("main >> text='Choose one'")
+        page.wait_for_selector("main h1")
+    page.click("nav a:has-text('Publish')")
+    page.fill("input[name=topic]", "a/#")
+    page.click("button:has-text('Open')")
+    assert page.evaluate("document.querySelector('input[name=topic]').validity.patternMismatch")
+    assert page.evaluate("location.hash") == "#/publish"

@@ -1,26 +1,28 @@
 // The topic that is looked at: every message up to FOCUS_RATE, its history, difference and plot.
 
+import { ABOUT } from './about.js'
 import { cut, decode, hexOf, preview } from './formats.js'
 
 const FOCUS_RATE = '30'
+const ABOUT_RATE = '2'
 const HISTORY = 200 // messages
 const HISTORY_BYTES = 16 * 1024 * 1024 // of them, with their properties
 const POINTS = 3000
 const SMALL = 64 * 1024 // bytes of a message of which every one is plotted
 
 export class Focus {
-  constructor(open, takeAbout) {
+  constructor(open, about) {
     this.topic = null
     this.clear()
     const client = open()
     this.client = client
     client.on('connect', () => {
-      client.subscribe('+/_appliance/+', { qos: 0 })
+      client.subscribe(ABOUT, { qos: 0, properties: { userProperties: { 'max-rate': ABOUT_RATE } } })
       if (this.topic !== null) this.subscribe()
     })
     client.on('error', () => {})
     client.on('message', (topic, buffer, packet) => {
-      if (topic.includes('/_appliance/')) takeAbout(topic, buffer)
+      about.take(topic, buffer)
       if (topic === this.topic) this.take(Uint8Array.from(buffer), packet, Date.now())
     })
   }

@@ -81,16 +81,7 @@ function take(told) {
   batch(() => {
     if (old.name !== told.state.name || old.reason !== told.state.reason) session.value = told.state
     drive.value = told.drive
-    if (told.about) {
-      const found = new Map(robots.peek())
-      for (const [name, value] of told.about) {
-        const [robot, what] = name.split(' ')
-        if (Array.isArray(value) || what !== 'routes') {
-          found.set(robot, { ...found.get(robot), [what]: value })
-        }
-      }
-      robots.value = found
-    }
+    if (told.about.length) takeAbout(told.about)
     if (told.token !== null && user.peek()) keep(told.token)
     if (untold.peek() !== told.untold) untold.value = told.untold
     if (!isPaused.peek()) takeRows(told.rows)
@@ -102,6 +93,16 @@ function take(told) {
       inspected.value = told.focus
     }
   })
+}
+
+function takeAbout(told) {
+  const found = new Map(robots.peek())
+  for (const [robot, what, value] of told) {
+    const about = { ...found.get(robot), [what]: value }
+    if (about.routes === undefined && about.skipped === undefined) found.delete(robot)
+    else found.set(robot, about)
+  }
+  robots.value = found
 }
 
 const held = [] // rows that came while the page was paused
@@ -174,7 +175,7 @@ export function signIn(name, password, token) {
   const url = `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/mqtt`
   user.value = name
   session.value = { name: 'connecting', reason: '' }
-  return ask('signIn', { url, user: name, password, token })
+  return ask('signIn', { url, user: name, password, token, robot })
 }
 
 /** Sign in again after the page was loaded again. */

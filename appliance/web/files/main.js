@@ -5,6 +5,7 @@ import { useEffect, useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
 import { names, resume, robot, robots, rows, session, signIn, signOut, user } from './link.js'
+import { isTopic } from './topic-name.js'
 
 const html = htm.bind(h)
 
@@ -35,6 +36,8 @@ const LOADERS = {
   health: () => import('./health.js'),
   enrol: () => import('./enrol.js'),
 }
+
+const OF_A_TOPIC = ['topics', 'publish', 'camera']
 
 const place = signal(where())
 
@@ -76,8 +79,16 @@ function Frame() {
         <button class="quiet" onClick=${signOut}>Sign out</button></span>
     </header>
     ${(name === 'lost' || reason) && html`<p class="notice bad" role="alert">${reason}</p>`}
-    <main tabindex="-1">${page === 'overview' ? html`<${Overview} />`
-    : html`<${Later} key=${page} page=${page} topic=${topic} />`}</main>`
+    <main tabindex="-1"><${Page} page=${page} topic=${topic} /></main>`
+}
+
+function Page({ page, topic }) {
+  if (page === 'overview') return html`<${Overview} />`
+  if (topic && OF_A_TOPIC.includes(page) && !isTopic(topic)) {
+    return html`<p class="notice bad" role="alert">This is not the name of a topic: it has a wildcard (+ or #), or is too
+      long. <a href=${`#/${page}`}>Choose one</a></p>`
+  }
+  return html`<${Later} key=${page} page=${page} topic=${topic} />`
 }
 
 function Later({ page, topic }) {

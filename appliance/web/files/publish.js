@@ -42,7 +42,8 @@ export default function Publish({ topic }) {
         <option value="">${toRos.length ? 'Choose one' : 'None is known'}</option>
         ${toRos.map(({ mqtt, type }) => html`<option key=${mqtt} value=${mqtt}>${mqtt} (${type})</option>`)}</select></label>
       <form class="tools" onSubmit=${open}><input name="topic" aria-label="Topic" placeholder="or any topic" autocapitalize="none"
-        spellcheck=${false} required maxlength="65535" value=${topic} key=${topic} /><button class="plain">Open</button></form>
+        spellcheck=${false} required maxlength="65535" pattern="[^+#]*"
+        title="The name of a topic, without wildcards (+ and #)" value=${topic} key=${topic} /><button class="plain">Open</button></form>
     </div>
     ${topic && html`<${Message} key=${topic} topic=${topic} route=${routes.find(({ mqtt }) => mqtt === topic)} />`}`
 }

@@ -3,6 +3,7 @@
 // page keeps that for when it is loaded again.
 
 import mqtt from './vendor/mqtt.esm.js'
+import { About } from './about.js'
 import { Drive } from './drive-link.js'
 import { Focus } from './focus.js'
 import { Newest } from './newest.js'
@@ -26,7 +27,7 @@ let shelved = { run: 0, wanted: [] } // what the open page wants kept
 let desk = null // the connection for calls, once somebody calls
 let state = { name: 'out', reason: '' }
 let newest = new Newest()
-let about = new Map() // what the appliance says about itself
+let about = null // what robots say of their bridges
 
 function options(more, packet) {
   return {
@@ -98,16 +99,17 @@ function subscribe(client, filters, rate) {
   })
 }
 
-function signIn({ url, user, password, token }) {
+function signIn({ url, user, password, token, robot }) {
   signOut()
   login = { url, user, password, token }
+  about = new About(robot)
   state = { name: 'connecting', reason: '' }
   const client = open({}, SURVEY_PACKET)
   survey = client
   client.on('connect', async () => {
     if (client !== survey) return
     state = { name: 'in', reason: '' }
-    focus ??= new Focus(() => open({}, FOCUS_PACKET), takeAbout)
+    focus ??= new Focus(() => open({}, FOCUS_PACKET), about)
     if (shelf === null) {
       shelf = new Shelf(focus.client)
       shelf.look(shelved)
@@ -150,9 +152,8 @@ function signOut() {
   for (const each of [focus, drive, shelf]) each?.stop()
   desk?.stop()
   survey?.end(true)
-  survey = focus = drive = shelf = desk = login = null
+  survey = focus = drive = shelf = desk = login = about = null
   newest = new Newest()
-  about = new Map()
   state = { name: 'out', reason: '' }
 }
 
@@ -190,33 +191,11 @@ function unwatch() {
 
 // -------------------------------------------------------------------------------------------------
 
-function takeAbout(topic, buffer) {
-  try {
-    if (buffer.length > 4 * 1024 * 1024) return
-    const what = topic.slice(topic.indexOf('/_appliance/') + 12)
-    if (what !== 'routes' && what !== 'skipped' && what !== 'state') return
-    const text = new TextDecoder().decode(buffer)
-    const value = what === 'state' ? text : JSON.parse(text)
-    const said = what === 'routes' ? value.filter(isRoute) : value
-    about.set(`${topic.slice(0, topic.indexOf('/'))} ${what}`, said)
-  } catch {
-    // Not ours then: what the appliance publishes is JSON.
-  }
-}
-
-/** Whether an entry has what all routes have: who may write `other/_appliance/routes` may say anything there. */
-function isRoute(entry) {
-  return entry !== null && ['ros', 'mqtt', 'type', 'direction'].every((name) => typeof entry[name] === 'string')
-}
-
 setInterval(() => newest.measure(), 1000)
 
 async function frame() {
   const told = { state, rows: newest.rows(), untold: newest.untold, token: login?.token ?? null }
-  if (about.size) {
-    told.about = [...about]
-    about.clear()
-  }
+  told.about = about?.told() ?? []
   told.focus = (await focus?.told()) ?? null
   told.drive = drive?.told() ?? null
   told.shelf = (await shelf?.told()) ?? null
@@ -256,13 +235,11 @@ const calls = {
 }
 
 self.onmessage = async ({ data: { number, call, values } }) => {
-  let answer = null
   try {
-    answer = await calls[call](values ?? {})
+    const answer = (await calls[call](values ?? {})) ?? null
+    const pictures = [answer?.bitmap, answer?.focus?.bitmap].filter(Boolean)
+    self.postMessage({ number, answer }, pictures)
   } catch (error) {
     self.postMessage({ number, error: String(error?.message ?? error) })
-    return
   }
-  const pictures = [answer?.bitmap, answer?.focus?.bitmap].filter(Boolean)
-  self.postMessage({ number, answer: answer ?? null }, pictures)
 }
