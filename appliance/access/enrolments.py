@@ -2,8 +2,9 @@
 
 Whoever manages users begins one and shows the code, as a QR code, to the person whose phone it is.
 That person chooses the password, which so nobody else learns. A code has no right of its own: it
-does what the one who has begun it may do when it is used. Codes are in memory only, as HMACs under
-a key of this process, so that neither the memory nor the time of a look-up tells one.
+does what the one who has begun it may do when it is used. As a token it ends with another password
+or the removal of its user, and of the one who has begun it. Codes are in memory only, as HMACs
+under a key of this process, so that neither the memory nor the time of a look-up tells one.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import hmac
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 from appliance.access.tokens import since_start
 from appliance.broker.values import Identity
@@ -26,6 +27,11 @@ MOST: Final = 64
 #: Random bytes of a code.
 _RANDOM: Final = 24
 
+#: The hash of a user's password; None for a user that is not in the users file.
+HashOf: TypeAlias = Callable[[str], "str | None"]
+
+_Stored: TypeAlias = "tuple[str | None, str | None]"
+
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
@@ -38,12 +44,15 @@ class Enrolment:
     groups: tuple[str, ...] | None
     by: Identity | None
     ends_at: float
+    #: The hashes of the passwords of both then, see `Enrolments._stored`.
+    stored: _Stored
 
 
 class Enrolments:
     """The codes that can be used now; belongs to the event loop."""
 
-    def __init__(self, clock: Callable[[], float] = since_start) -> None:
+    def __init__(self, hash_of: HashOf, clock: Callable[[], float] = since_start) -> None:
+        self._hash_of = hash_of
         self._clock = clock
         self._key = secrets.token_bytes(32)
         self._pending: dict[bytes, Enrolment] = {}
@@ -61,17 +70,32 @@ class Enrolments:
         if len(self._pending) >= MOST:
             return None
         code = secrets.token_urlsafe(_RANDOM)
-        self.put_back(code, Enrolment(username, groups, by, now + LIFETIME))
+        stored = self._stored(username, groups, by)
+        self._pending[self._digest(code)] = Enrolment(username, groups, by, now + LIFETIME, stored)
         return code
 
     def take(self, code: str) -> Enrolment | None:
-        """What the code is for; nobody finds it again. None for a code that is unknown or old."""
+        """What the code is for; nobody finds it again. None for a code that is unknown or ended."""
         found = self._pending.pop(self._digest(code), None)
-        return found if found is not None and found.ends_at > self._clock() else None
+        if found is None or found.ends_at <= self._clock():
+            return None
+        stored = self._stored(found.username, found.groups, found.by)
+        return found if found.stored == stored else None
 
     def put_back(self, code: str, enrolment: Enrolment) -> None:
-        """Let the code be used: nothing came of it."""
-        self._pending[self._digest(code)] = enrolment
+        """Let the code be used, as nothing came of it; unless there is a later one of this user."""
+        if all(each.username != enrolment.username for each in self._pending.values()):
+            self._pending[self._digest(code)] = enrolment
 
     def _digest(self, code: str) -> bytes:
         return hmac.digest(self._key, code.encode(), "sha256")
+
+    def _stored(
+        self, username: str, groups: tuple[str, ...] | None, by: Identity | None
+    ) -> _Stored:
+        """The hash of the user, if it is there already, and of the one who begins the enrolment."""
+        maker = None if by is None else by.username
+        return (
+            self._hash_of(username) if groups is None else None,
+            self._hash_of(maker) if maker is not None else None,
+        )

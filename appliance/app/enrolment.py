@@ -72,7 +72,7 @@ def enrol(parts: EnrolmentParts) -> Resource:
         if enrolment is None:
             throttle.record_failure(request.address, "")
             parts.login.note(request, None, _UNKNOWN)
-            return text(403, "this code was used, is older than 10 minutes, or is not of here")
+            return text(403, "this code was used, has ended, or is not of here")
         try:
             await carry_out(parts.broker, verbs, enrolment, password, request.address)
         except CallError as error:

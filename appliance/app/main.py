@@ -199,7 +199,7 @@ class App:
         self._pulse = Pulse(broker, listeners.scheduler, self._inside, loop.time)
         self._tls, self._store = tls, store
         self._login, self._access = login, access
-        self._enrolments = Enrolments()
+        self._enrolments = Enrolments(lambda user: access.in_force.passwords.hash_of(user))
         self._start_clock(loop)
         # Before the listeners start, and stopped after them: whatever a client is acknowledged is
         # offered to the links.

@@ -17,7 +17,7 @@ class Clock:
 
 def test_a_code_is_used_once_and_in_time():
     clock = Clock()
-    enrolments = Enrolments(clock)
+    enrolments = Enrolments({}.get, clock)
     code = enrolments.begin("bob", ("viewers",), ADMIN)
     assert code is not None and len(code) == 32  # 192 bits
     assert code.encode() not in b"".join(enrolments._pending)
@@ -37,7 +37,7 @@ def test_a_code_is_used_once_and_in_time():
 
 def test_codes_are_bounded():
     clock = Clock()
-    enrolments = Enrolments(clock)
+    enrolments = Enrolments({}.get, clock)
     first = enrolments.begin("0", None, None)
     assert first is not None
     assert enrolments.begin("0", None, None) not in (None, first)
@@ -48,3 +48,29 @@ def test_codes_are_bounded():
     clock.now += LIFETIME
     assert enrolments.begin("one more", None, None) is not None
     assert len(enrolments._pending) == 1
+
+
+def test_another_password_or_a_removal_ends_a_code():
+    """Of its user, who may be another one of that name, and of who has made it."""
+    hashes = {"bob": "1", "admin": "2"}
+    enrolments = Enrolments(hashes.get, Clock())
+    for name in ("bob", "admin"):
+        for now in ("another", None):
+            code = enrolments.begin("bob", None, ADMIN) or ""
+            before = hashes.pop(name)
+            hashes |= {name: now} if now else {}
+            assert enrolments.take(code) is None, (name, now)
+            hashes[name] = before
+    code = enrolments.begin("bob", None, ADMIN) or ""
+    hashes["carol"] = "3"
+    assert enrolments.take(code) is not None
+
+
+def test_a_code_that_is_put_back_makes_no_second_one():
+    enrolments = Enrolments({}.get, Clock())
+    first = enrolments.begin("bob", None, ADMIN) or ""
+    found = enrolments.take(first)
+    assert found is not None
+    later = enrolments.begin("bob", None, ADMIN) or ""  # while the first one's password is refused
+    enrolments.put_back(first, found)
+    assert enrolments.take(first) is None and enrolments.take(later) is not None

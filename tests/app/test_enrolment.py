@@ -130,6 +130,15 @@ async def test_a_code_gives_no_right_that_its_maker_has_not(web: WebApp):
     assert not web.app._access.knows("carol")
 
 
+async def test_a_code_of_who_is_no_user_any_more(web: WebApp):
+    """The rules of its maker still stand in the file."""
+    await call(web, "user_add", user="helper", password="helper's")
+    code = await begin(web, "carol", HELPER, groups=[])
+    await call(web, "user_remove", user="helper")
+    assert (await use(web, code))[0] == 403
+    assert not web.app._access.knows("carol")
+
+
 async def test_a_user_that_came_meanwhile(web: WebApp):
     code = await begin(web, "carol", groups=[])
     await call(web, "user_add", user="carol", password="first")
