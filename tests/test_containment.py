@@ -851,6 +851,11 @@ async def _looks(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.node.spin()
 
 
+@reach("bridge.announcing")
+async def _announces_many(site: Site, patch: pytest.MonkeyPatch) -> None:
+    site.bridge._announcements._go_on(iter((None,)), site.bridge._session)
+
+
 @reach("bridge.live")
 async def _watches(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.bridge._live._go_on(iter(()), [], site.bridge._session)

@@ -78,7 +78,7 @@ class Status:
         elif bridge.state != "joined" and (problem := bridge.problem or bridge.obstacle):
             ros = f"no ROS: {problem}"
         elif bridge.state == "joined":
-            ros = f"on ROS as {bridge.node_name}, {_count(len(bridge.topics()), 'topic')} bridged"
+            ros = f"on ROS as {bridge.node_name}, {_count(bridge.count_topics(), 'topic')} bridged"
         else:
             ros = "joining ROS"
         text = f"{_count(len(self._parts.broker.clients), 'client')}, {ros}"
@@ -270,7 +270,7 @@ class Status:
             for call in calls
             if call.counters.last_error and not call.names
         ]
-        bridged = len(bridge.topics()) + len(bridge.calls.bridged())
+        bridged = bridge.count_topics() + len(bridge.calls.bridged())
         return {"count": len(topics) + len(calls), "bridged": bridged, "sick": sick}
 
     def _errors(self) -> dict[str, Any]:

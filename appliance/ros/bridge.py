@@ -19,16 +19,14 @@ from time import time_ns
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
-import orjson
-
 from appliance.broker.broker import Broker
 from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
 from appliance.broker.session import Session, publisher_of
-from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, PeriodicCallback
+from appliance.ros.announcements import Announcements
 from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics, DiagnosticsTopic
 from appliance.ros.graph_follower import FlowKey, GraphFollower, TopicRoutes
@@ -36,11 +34,10 @@ from appliance.ros.live import LiveFigures
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
 from appliance.ros.payload.converter import Converters
-from appliance.ros.payload.encodings.registry import CONTENT_TYPE
 from appliance.ros.retained_cleanup import RetainedCleanup, TopicOwners
 from appliance.ros.ros2.discovery import TWIN, TWIN_ADVICE
 from appliance.ros.schema_topics import SchemaTopics
-from appliance.ros.skipped import Skipped, ordered, summary
+from appliance.ros.skipped import Skipped, ordered
 from appliance.ros.status import (
     RouteStatus,
     RouteTotal,
@@ -52,7 +49,7 @@ from appliance.ros.status import (
 from appliance.ros.topics.commands import Commands
 from appliance.ros.topics.conversions import LITTLE, ConversionQueue, size_of
 from appliance.ros.topics.factory import FlowFactory
-from appliance.ros.topics.flow import Flow
+from appliance.ros.topics.flow import Flow, bridged
 from appliance.ros.topics.lease import BRIDGE_CLIENT_ID, Leases
 from appliance.ros.topics.off_loop import ConversionThreads
 from appliance.ros.topics.route import BridgedTopic, BridgeRoute, Direction, TopicSettings
@@ -91,8 +88,6 @@ DRAIN_AGAIN = 0.05
 
 BusState: TypeAlias = Literal["waiting", "joined", "lost"]
 
-JSON_PROPERTIES: Properties = {Property.CONTENT_TYPE: CONTENT_TYPE["json"]}
-
 
 class Bridge:
     """Carries the topics of routes between a node and the broker; belongs to the loop's thread.
@@ -129,9 +124,8 @@ class Bridge:
         self._loop = loop
         self._faults = broker.faults
         self._entries = entries = Entries(loop, broker.faults)
-        self._topic = f"{robot}/_appliance/routes"
-        self._skipped_topic = f"{robot}/_appliance/skipped"
         self._schemas = SchemaTopics(broker, entries, robot, node.describe)
+        self._announcements = Announcements(broker, entries, robot, self, self._schemas.replace)
         self._session: Session | None = None
         self._cleanup = RetainedCleanup(broker, entries)
         self._live = LiveFigures(broker, entries, robot)
@@ -150,9 +144,6 @@ class Bridge:
         self._meter_timer: PeriodicCallback | None = None
         self._metered = 0
         self._announce_timer: asyncio.TimerHandle | None = None
-        #: The payloads that were published last.
-        self._announced = b""
-        self._announced_skips = b""
         self._routes: list[BridgeRoute] = []
         #: Topics that a route names; such a route takes precedence over patterns.
         self._named: dict[Direction, frozenset[str]] = {}
@@ -343,7 +334,7 @@ class Bridge:
         while self._deliver():
             pass
         await self.calls.stop()
-        self._announce()
+        self._announcements.stop(session)
         self._schemas.stop()
         self._cleanup.stop()
         self._session = None
@@ -359,21 +350,25 @@ class Bridge:
 
     def _by_route(self) -> list[tuple[BridgeRoute, list[Flow]]]:
         flows: dict[BridgeRoute, list[Flow]] = {}
-        for flow in self._flows():
+        for flow in self.flows():
             flows.setdefault(flow.route, []).append(flow)
         return [(route, flows.get(route, [])) for route in self._routes]
 
     def topics(self) -> list[TopicStatus]:
         """What is bridged now, with its metrics."""
-        flows = [(flow, flow.bridged) for flow in self._flows()]
-        return [topic_status(bridged, flow) for flow, bridged in flows if bridged is not None]
+        return [topic_status(topic, flow) for topic, flow in bridged(self.flows())]
+
+    def count_topics(self) -> int:
+        """How many topics are bridged now."""
+        return sum(1 for _ in bridged(self.flows()))
 
     def skips(self) -> list[Skipped]:
         """What routes include and is not bridged, and why."""
-        of_flows = [skip for flow in self._flows() for skip in flow.skips()]
+        of_flows = [skip for flow in self.flows() for skip in flow.skips()]
         return ordered([*of_flows, *self._follower.followed.refused, *self.calls.skips()])
 
-    def _flows(self) -> list[Flow]:
+    def flows(self) -> list[Flow]:
+        """Of all topics of routes, bridged now or not."""
         followed = self._follower.followed
         named = [flow for flow in self._to_ros.values() if not flow.is_matched]
         return [*followed.to_mqtt, *named, *followed.matched]
@@ -479,18 +474,8 @@ class Bridge:
 
     def _announce(self) -> None:
         """Publish what is bridged and what is skipped, where that or a metric in it has changed."""
-        topics = self.topics()
-        payload = orjson.dumps([*topics, *self.calls.bridged()])
-        if self._session is not None and payload != self._announced:
-            self._announced = payload
-            self._publish_retained(self._topic, payload, self._session)
-            self._schemas.replace((*(topic.type for topic in topics), *self.calls.types()))
-            self._broker.flush()
-        payload = orjson.dumps(summary(self.skips()))
-        if self._session is not None and payload != self._announced_skips:
-            self._announced_skips = payload
-            self._publish_retained(self._skipped_topic, payload, self._session)
-            self._broker.flush()
+        if self._session is not None:
+            self._announcements.publish(self._session)
 
     def _announce_soon(self) -> None:
         """Another client holds a lease, or none does: announce that, with what follows."""
@@ -503,12 +488,9 @@ class Bridge:
         self._announce_timer = None
         self._announce()
 
-    def _publish_retained(self, topic: str, payload: bytes, session: Session) -> None:
-        self._broker.publish(Message(topic, payload, 0, True, JSON_PROPERTIES), session)
-
     def _meter(self) -> None:
         now = self._loop.time()
-        flows = self._flows()
+        flows = self.flows()
         for flow in flows:
             flow.meter.tick(now, flow.counters.messages, flow.counters.bytes)
         if self._session is not None:

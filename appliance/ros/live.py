@@ -16,7 +16,7 @@ from appliance.mqtt.codec import Properties, Property
 from appliance.net.callbacks import Entries
 from appliance.ros.payload.encodings.registry import CONTENT_TYPE
 from appliance.ros.status import latency_status
-from appliance.ros.topics.flow import Flow
+from appliance.ros.topics.flow import Flow, bridged
 from appliance.ros.topics.route import BridgedTopic
 
 #: The most topics with figures. An entry has some 160 bytes.
@@ -45,8 +45,7 @@ class LiveFigures:
         if self._is_busy or not self._broker.router.is_watched(self._topic):
             return
         self._is_busy = True
-        bridged = ((topic, flow) for flow in flows if (topic := flow.bridged) is not None)
-        self._go_on(bridged, [], session)
+        self._go_on(bridged(flows), [], session)
 
     def _go_on(
         self,

@@ -954,7 +954,7 @@ async def test_a_flow_that_has_ended_is_freed_without_the_garbage_collector(harn
     harness.client.send("r2d2/cmd_vel", b'{"linear": {"x": 1.0}}')
     harness.client.send("r2d2/both", b'{"data": "3"}')
     await harness.settle()
-    flows = [weakref.ref(flow) for flow in bridge._flows()]
+    flows = [weakref.ref(flow) for flow in bridge.flows()]
     assert sorted(type(flow()).__name__ for flow in flows) == [
         *("Commands", "ToMqtt", "ToMqtt", "ToRos", "ToRos")
     ]
@@ -1007,7 +1007,7 @@ async def test_what_the_two_threads_count_is_added_up_and_logged_once(harness, c
     counted = status.messages, status.errors, status.dropped, status.lost
     assert counted == (1, 2, 2, 3)
     assert caplog.text.count("a message cannot be converted") == 1
-    (flow,) = harness.bridge._flows()
+    (flow,) = harness.bridge.flows()
     assert (flow.counters.errors, flow.follower.counters.errors) == (1, 1)
     assert status.last_error == flow.counters.last_error
     subscription.callback(b"")

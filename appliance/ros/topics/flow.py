@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Iterable, Iterator
 from time import monotonic
 
 from appliance.broker.meter import Meter
@@ -93,3 +94,8 @@ class Flow:
     def commanding(self) -> str | None:
         """The client that holds the lease of an exclusive route, if there is one."""
         return None
+
+
+def bridged(flows: Iterable[Flow]) -> Iterator[tuple[BridgedTopic, Flow]]:
+    """Those that carry something now, with what they carry."""
+    return ((topic, flow) for flow in flows if (topic := flow.bridged) is not None)

@@ -112,7 +112,7 @@ async def test_a_picture_in_the_mailbox_is_counted_and_taken_back_with_its_route
 ) -> None:
     harness.start(to_mqtt("/image", encoding="jpeg", retain=True))
     (route,) = harness.bridge._routes
-    (flow,) = harness.bridge._flows()
+    (flow,) = harness.bridge.flows()
     monkeypatch.setattr(harness.bridge, "_wake", lambda: None)
     monkeypatch.setattr(harness.bridge._mailbox, "_wake", lambda: None)  # the loop is busy
     harness.node.add_publisher("/image", IMAGE).publish(FRAME)
@@ -132,7 +132,7 @@ async def test_a_flow_that_opens_again_makes_pictures_again(
     camera = harness.node.add_publisher("/image", IMAGE)
     camera.publish(FRAME)
     await until(lambda: gate.began, "a conversion")
-    (flow,) = harness.bridge._flows()
+    (flow,) = harness.bridge.flows()
     flow.follower.reset("a fault")
     harness.node.spin()
     camera.publish(image(bytes(3), 1, 1))
