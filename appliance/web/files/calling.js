@@ -1,7 +1,7 @@
 // What the pages of calls share: topics that are kept while one is open, rights, and the request's form.
 
 import { h } from './vendor/preact.mjs'
-import { useEffect, useState } from './vendor/hooks.mjs'
+import { useEffect, useMemo, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
 import { shelf, shelve, verb } from './link.js'
 import { Editor, mayBeSent, useMessage, withoutEnter } from './editor.js'
@@ -72,7 +72,8 @@ export function schemaOf({ robot, type }, part) {
 }
 
 export function Json({ text, label }) {
-  return html`<pre tabindex="0" aria-label=${label}>${indented(text)}</pre>`
+  const shown = useMemo(() => indented(text), [text])
+  return html`<pre tabindex="0" aria-label=${label}>${shown}</pre>`
 }
 
 /** What is wrong with a field, by the words of a call that was refused; null where they name none. */

@@ -2,6 +2,8 @@
 // again what was not acknowledged, and nobody wants a command twice. The next call opens another one.
 // An answer comes below `_reply/{client id}`, which needs no right to write (docs/calls.md).
 
+import { valueOf } from './json-text.js'
+
 const PACKET = 2 * 1024 * 1024
 const TIMEOUT = 10000 // ms for an answer
 const REFUSED = 0x80 // reason codes from here on
@@ -114,10 +116,6 @@ export class Calls {
 }
 
 function errorIn(text) {
-  try {
-    const { error } = JSON.parse(text) ?? {}
-    return typeof error?.code === 'string' ? `${error.code}: ${error.message}` : ''
-  } catch {
-    return ''
-  }
+  const error = valueOf(text)?.error
+  return typeof error?.code === 'string' ? `${error.code}: ${error.message}` : ''
 }

@@ -9,31 +9,20 @@ import { contentType } from './formats.js'
 export default class Camera {
   constructor(open, { topic, rate }) {
     this.newest = null
-    this.isNews = true
     this.skipped = 0
-    this.wake = () => {}
     this.watch = new Watch(open, [[topic, rate]], (_, payload, properties, at) => {
       if (this.newest !== null) this.skipped += 1
       this.newest = { payload, properties, at }
-      this.wake()
-    }, () => {
-      this.isNews = true
-      this.wake()
     })
   }
 
   stop() {
     this.watch.stop()
-    this.wake()
   }
 
   /** The next picture, or what has become of the connection; null when it is over. */
   async next() {
-    while (this.newest === null && !this.isNews && !this.watch.isOver) {
-      await new Promise((resolve) => { this.wake = resolve })
-    }
-    if (this.watch.isOver) return null
-    this.isNews = false
+    if (!await this.watch.news()) return null
     const { newest, watch, skipped } = this
     this.newest = null
     const told = { reason: watch.reason, skipped, problem: '' }

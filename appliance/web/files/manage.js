@@ -2,9 +2,9 @@
 // questions before a change. All names come from strangers: they are shown as text, and cut.
 
 import { h } from './vendor/preact.mjs'
-import { useEffect, useReducer, useRef, useState } from './vendor/hooks.mjs'
+import { useEffect, useLayoutEffect, useReducer, useRef, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
-import { useRights as useTopicRights } from './calling.js'
+import { lack, useRights as useTopicRights } from './calling.js'
 import { verb } from './link.js'
 
 export const html = htm.bind(h)
@@ -13,13 +13,10 @@ export const html = htm.bind(h)
 export function useRights(verbs) {
   const topicOf = (name) => `$CONTROL/appliance/v1/${name}/_call`
   const rights = useTopicRights(verbs.map(topicOf))
-  return rights && Object.fromEntries(verbs.map((name) => [name, rights.get(topicOf(name)) ?? '']))
+  return rights && new Map(verbs.map((name) => [name, lack(rights, topicOf(name))]))
 }
 
-/** What keeps the user from calling a verb: a line of the ACL, or '' if nothing does. */
-export function lack(rights, name) {
-  return rights === null ? '…' : rights[name] ?? ''
-}
+export { lack }
 
 /**
  * What a verb answers: {answer, error, again}. `values` are null while it is not to be asked; `every`
@@ -55,11 +52,11 @@ export function useAnswer(name, values, every = 0) {
 
 /** The lines that the user lacks for what a page offers: pairs of a verb and what it is for. */
 export function Lacking({ rights, of }) {
-  const found = of.filter(([name]) => rights?.[name])
+  const found = of.filter(([name]) => rights?.get(name))
   if (found.length === 0) return null
   return html`<div class="notice"><p>This user may not do all of this. These lines of the
     access rules, below the user’s, would allow it:</p>
-    <ul>${found.map(([name, what]) => html`<li key=${name}>${what}: <code>${rights[name]}</code></li>`)}</ul></div>`
+    <ul>${found.map(([name, what]) => html`<li key=${name}>${what}: <code>${rights.get(name)}</code></li>`)}</ul></div>`
 }
 
 export function Problem({ words }) {
@@ -125,7 +122,7 @@ export function ticked(fields) {
 export function Question({ title, word, act, done, close, children }) {
   const dialog = useRef(null)
   const [told, setTold] = useState({ words: '', isBusy: false })
-  useEffect(() => { dialog.current.showModal() }, [])
+  useLayoutEffect(() => { dialog.current.showModal() }, []) // a key may be pressed at once
   const go = async () => {
     setTold({ words: '', isBusy: true })
     try {

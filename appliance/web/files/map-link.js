@@ -12,33 +12,22 @@ export default class MapView {
   constructor(open, { topics, isCloud }) {
     this.readers = { grid: gridOf, pose: poseOf, scan: isCloud ? cloudOf : scanOf }
     this.newest = {}
-    this.isNews = true
-    this.wake = () => {}
     const parts = Object.keys(RATES).filter((part) => topics[part])
     const wanted = parts.map((part) => [topics[part], RATES[part]])
     this.watch = new Watch(open, wanted, (topic, payload, properties, at) => {
       for (const part of parts) {
         if (topics[part] === topic) this.newest[part] = { payload, properties, at }
       }
-      this.wake()
-    }, () => {
-      this.isNews = true
-      this.wake()
     })
   }
 
   stop() {
     this.watch.stop()
-    this.wake()
   }
 
   /** What is new: parts by their names, each read or with its problem; null when it is over. */
   async next() {
-    while (Object.keys(this.newest).length === 0 && !this.isNews && !this.watch.isOver) {
-      await new Promise((resolve) => { this.wake = resolve })
-    }
-    if (this.watch.isOver) return null
-    this.isNews = false
+    if (!await this.watch.news()) return null
     const { newest, watch } = this
     this.newest = {}
     const told = { reason: watch.reason, parts: {} }

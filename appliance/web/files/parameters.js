@@ -3,7 +3,8 @@
 import { useState } from './vendor/hooks.mjs'
 import { request } from './link.js'
 import { html, lack, Lacking, patience, Refused, useRights, useShelf } from './calling.js'
-import { faultOf, objectText, valueOf } from './json-text.js'
+import { parse, print } from './exact.js'
+import { faultOf, valueOf } from './json-text.js'
 
 const SHOWN = 150 // parameters
 const INTEGER = /^-?\d+$/
@@ -55,7 +56,7 @@ export default function Parameters({ entry }) {
     const isOne = values.length === 1 && !lack(rights, `${mqtt}/${name}/set`)
     try {
       if (isOne) await request(`${mqtt}/${name}/set`, value, patience(entry))
-      else await request(`${mqtt}/_set`, objectText(values), patience(entry))
+      else await request(`${mqtt}/_set`, print(new Map(values.map(([each, text]) => [each, parse(text)]))), patience(entry))
       setDrafts(new Map())
       setState({ isBusy: false, error: '', done: values.length === 1 ? `${name} is set.` : `${values.length} parameters are set.` })
     } catch (error) {

@@ -7,6 +7,7 @@ import htm from './vendor/htm.mjs'
 import { robots } from './link.js'
 import { Refused, useShelf } from './calling.js'
 import { size } from './formats.js'
+import { valueOf } from './json-text.js'
 
 const html = htm.bind(h)
 
@@ -53,12 +54,7 @@ function figuresOf(topics) {
   const found = new Map()
   for (const [topic, entry] of topics) {
     const robot = topic.slice(0, topic.indexOf('/'))
-    let said
-    try {
-      said = JSON.parse(entry.text)
-    } catch {
-      continue
-    }
+    const said = valueOf(entry.text)
     if (!Array.isArray(said?.routes)) continue
     for (const route of said.routes) {
       if (typeof route?.mqtt !== 'string') continue

@@ -1,20 +1,22 @@
-// The connection of a page that watches a few topics: each at a rate of its own, the newest kept.
+// The connection of a page that watches a few topics, each at a rate of its own.
 
 export const PACKET = 17 * 1024 * 1024 // a picture has at most 16 MiB
 
 const REFUSED = new Set([0x86, 0x87, 0x8a]) // bad user name or password, not authorized, banned
 
 export class Watch {
-  /** Each of `wanted` is [topic, messages a second]; `take` gets each message, `tell` what changed. */
-  constructor(open, wanted, take, tell) {
+  /** Each of `wanted` is [topic, messages a second]; `take` gets each message, and keeps what it wants. */
+  constructor(open, wanted, take) {
     this.reason = ''
     this.isOver = false
+    this.isNews = true
+    this.wake = () => {}
     const client = open({}, PACKET)
     this.client = client
     const say = (reason) => {
       if (this.isOver || reason === this.reason) return
       this.reason = reason
-      tell()
+      this.tell()
     }
     client.on('connect', () => {
       say('')
@@ -28,7 +30,9 @@ export class Watch {
     })
     client.on('message', (topic, buffer, packet) => {
       // A copy: the buffer is a view of all that has come with it.
-      if (!this.isOver) take(topic, new Uint8Array(buffer), packet.properties ?? {}, Date.now())
+      if (this.isOver) return
+      take(topic, new Uint8Array(buffer), packet.properties ?? {}, Date.now())
+      this.tell()
     })
     client.on('error', (error) => {
       if (!REFUSED.has(error.code)) return
@@ -41,6 +45,19 @@ export class Watch {
   stop() {
     this.isOver = true
     this.client.end(true)
+    this.tell()
+  }
+
+  tell() {
+    this.isNews = true
+    this.wake()
+  }
+
+  /** Wait until a message has come, or `reason` is another one. False when it is over. */
+  async news() {
+    while (!this.isNews && !this.isOver) await new Promise((resolve) => { this.wake = resolve })
+    this.isNews = false
+    return !this.isOver
   }
 }
 
