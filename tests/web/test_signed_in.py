@@ -138,3 +138,18 @@ def test_the_appliance_starts_again(
             and "WebSocket connection" not in wrong
         ]
     assert back_after < BACK_WITHIN
+
+
+def test_a_program_that_could_not_be_loaded_is_loaded_by_the_next_login(
+    visit: Callable[..., Visit],
+) -> None:
+    visited = visit(**DESKTOP)
+    page = visited.page
+    page.route("**/worker.js", lambda route: route.abort())
+    page.fill("input[name=user]", "alice")
+    page.fill("input[name=password]", "any")
+    page.click("form button")
+    page.wait_for_selector("form .notice:has-text('could not be loaded')")
+    page.unroute("**/worker.js")
+    visited.sign_in()
+    visited.wrong.clear()  # which were meant

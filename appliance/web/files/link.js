@@ -40,22 +40,34 @@ export function tell(call, values) {
 
 function start() {
   worker = new Worker(new URL('./worker.js', import.meta.url), { type: 'module' })
+  let isLoaded = false
   worker.onmessage = ({ data }) => {
+    isLoaded = true
     const found = waiting.get(data.number)
     waiting.delete(data.number)
     if (data.error === undefined) found?.resolve(data.answer)
     else found?.reject(new Error(data.error))
   }
   worker.onerror = () => {
-    session.value = { name: 'failed', reason: 'The connection’s program could not be loaded.' }
+    if (!isLoaded) notLoaded() // later ones are in the browser's log
   }
   requestAnimationFrame(frame)
+}
+
+/** Whoever signs in next loads it again. */
+function notLoaded() {
+  const reason = 'The connection’s program could not be loaded.'
+  session.value = { name: 'failed', reason }
+  worker = null
+  for (const { reject } of waiting.values()) reject(new Error(reason))
+  waiting.clear()
 }
 
 let asked = 0
 
 /** One question at a time, and none while the page is hidden: the browser draws no frames then. */
 async function frame(now) {
+  if (worker === null) return
   if (now - asked < FRAME) {
     requestAnimationFrame(frame)
     return
@@ -114,17 +126,17 @@ export function pause(paused) {
 }
 
 function takeRows(told) {
-  let isMore = false
+  const more = []
   for (const [topic, text, size, rate, at, retain] of told) {
     const row = { text, size, rate, at, retain }
     const known = rows.get(topic)
     if (known) known.value = row
     else {
       rows.set(topic, signal(row))
-      isMore = true
+      more.push(topic)
     }
   }
-  if (isMore) names.value = [...rows.keys()].sort()
+  if (more.length) names.value = [...names.peek(), ...more].sort() // nearly sorted: that is quick
 }
 
 /** Load the page anew: whoever signs in next finds nothing of this user in its memory. */

@@ -2,10 +2,10 @@
 
 import { h } from './vendor/preact.mjs'
 import { useEffect, useMemo, useRef, useState } from './vendor/hooks.mjs'
-import { signal } from './vendor/signals.mjs'
+import { computed, signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
 import { shown } from './formats.js'
-import { ask, focus, inspected, isPaused, names, pause, robots, rows, tell, untold } from './link.js'
+import { ask, focus, inspected, isPaused, names, pause, robot, robots, rows, tell, untold } from './link.js'
 import { save } from './save.js'
 
 const html = htm.bind(h)
@@ -101,12 +101,21 @@ function Row({ name, label, topic }) {
     <span class="rate">${rateOf(name, row)}</span></a></li>`
 }
 
+/** The rates of what is bridged, by topic; what this robot says counts before what others do. */
+const rates = computed(() => {
+  const found = new Map()
+  for (const about of [...robots.value.values(), robots.value.get(robot)]) {
+    for (const { mqtt, direction, rate } of about?.routes ?? []) {
+      if (direction === 'to_mqtt' && Number.isFinite(rate)) found.set(mqtt, rate)
+    }
+  }
+  return found
+})
+
 /** Messages a second: of a bridged topic as the bridge counts them, of others as many as come here. */
 function rateOf(name, row) {
-  for (const { routes } of robots.value.values()) {
-    const route = routes?.find((each) => each?.mqtt === name && each.direction === 'to_mqtt')
-    if (route && typeof route.rate === 'number') return `${route.rate} Hz`
-  }
+  const bridged = rates.value.get(name)
+  if (bridged !== undefined) return `${bridged} Hz`
   if (row.rate < 0.05) return row.retain ? 'retained' : ''
   return row.rate >= 1.8 ? '≥ 2 Hz' : `${row.rate.toFixed(1)} Hz`
 }
