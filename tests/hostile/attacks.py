@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import itertools
 import math
@@ -701,6 +702,11 @@ async def web_headers(load: Load) -> None:
         await line.send(next(requests))
         return line
 
+    await _finish_at_once(load, wait)
+
+
+async def _finish_at_once(load: Load, wait: Callable[[int], Awaitable[Line]]) -> None:
+    """Send the last byte of 245 requests, of which `wait` has sent the rest, again and again."""
     while load.on:
         lines = await load.crowd(245, wait, 1.0)
         await asyncio.sleep(0.1)  # for the broker to have read them
@@ -720,6 +726,79 @@ def _headers(size: int, count: int = 0) -> bytes:
     if not count:
         return b"a:\r\n" * (size // 4)
     return (b"a: " + b"b" * (size // count - 5) + b"\r\n") * count
+
+
+# --- over HTTP
+
+
+@attack(rf"{ADDRESS}: no HTTP request", at_least=2.0, over=Over.PLAIN, connect_timeout="10 s")
+async def http_headers(load: Load) -> None:
+    """The last byte of 245 requests with as many headers as may be, or one of many parts, all in
+    one moment."""
+    begin = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
+    # All but the last byte, a line feed.
+    requests = itertools.cycle(
+        [
+            begin + _headers(15_000) + b"\r",
+            begin + _headers(15_000, 120) + b"\r",
+            begin + b"Accept-Encoding: " + b"," * 15_000 + b"\r\n\r",
+            begin + b"Connection: " + b"a," * 7_500 + b"\r\n\r",
+            begin + b"a: b\r\n" + b" c\r\n" * 3_500 + b"\r",
+        ]
+    )
+
+    async def wait(_: int) -> Line:
+        line = await load.http()
+        await line.send(next(requests))
+        return line
+
+    await _finish_at_once(load, wait)
+
+
+@attack(CLIENT, at_least=3.0, over=Over.PLAIN, connect_timeout="10 s")
+async def http_bodies(load: Load) -> None:
+    """Bodies of 1 MiB for the API that are nothing but empty lists."""
+    body = b'{"topic": "%s", "payload": [%s[]]}' % (AREA.encode(), b"[]," * 340_000)
+    await load.together(*(_post_forever(load, _post(load, len(body)) + body) for _ in range(4)))
+    assert load.counts["answers"]
+
+
+@attack(CLIENT, at_least=4.0, over=Over.PLAIN, connect_timeout="3 s")
+async def http_bodies_dripped(load: Load) -> None:
+    """200 bodies for the API that come a byte at a time, behind the first 100 KiB."""
+    head = _post(load, 1_000_000)
+
+    async def begin(_: int) -> Line:
+        line = await load.http()
+        await line.send(head + bytes(100_000))
+        return line
+
+    async for _ in load.rounds(0.2):
+        await load.crowd(200 - len(load.lines), begin, 1.0)
+        for line in list(load.lines):
+            if line.open:
+                line.send_nowait(b"x")
+                load.counts["bytes"] += 1
+            else:
+                load.lines.discard(line)
+
+
+def _post(load: Load, length: int) -> bytes:
+    """The head of a request that publishes."""
+    login = base64.b64encode(f"{USER}:{load.target.passwords[USER]}".encode())
+    return (
+        b"POST /api/v1/publish HTTP/1.1\r\nHost: localhost\r\nAuthorization: Basic %s\r\n"
+        b"Content-Type: application/json\r\nContent-Length: %d\r\n\r\n" % (login, length)
+    )
+
+
+async def _post_forever(load: Load, request: bytes) -> None:
+    while load.on:
+        line = await load.http()
+        await line.send(request)
+        load.counts["answers"] += await line.receive(1)
+        line.abort()
+        load.lines.discard(line)
 
 
 # --- behind a login: who does not listen

@@ -202,9 +202,11 @@ class Load:
             number += 1
             await asyncio.sleep(pause)
 
-    async def raw(self, over: Over | None = None, *, receive_buffer: int = 0) -> socket.socket:
+    async def raw(
+        self, over: Over | None = None, *, receive_buffer: int = 0, port: int = 0
+    ) -> socket.socket:
         """A TCP connection to one of the listeners; nothing has been sent on it."""
-        port = self.target.port_of(over or next(self._next_way))
+        port = port or self.target.port_of(over or next(self._next_way))
         sock = socket.socket()
         try:
             sock.setblocking(False)
@@ -238,6 +240,13 @@ class Load:
         self.lines.add(line)
         if isinstance(line, WebLine):
             await line.upgrade()
+        return line
+
+    async def http(self) -> Line:
+        """A connection to the listener for the web, without TLS."""
+        sock = await self.raw(port=self.target.http_port)
+        _, line = await self._loop.create_connection(lambda: Line(sock), sock=sock)
+        self.lines.add(line)
         return line
 
     async def join(

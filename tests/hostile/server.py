@@ -40,8 +40,8 @@ LIMITS: dict[str, Any] = {
     "connect_timeout": "1 s",
 }
 
-#: The WebSocket listener comes before these: the appliance counts as started when it listens on
-#: these two.
+#: Those for WebSocket and for the web come before these: the appliance counts as started when it
+#: listens on these two.
 LISTENERS: list[dict[str, Any]] = [{"bind": "127.0.0.1:0", "tls": True}, {"bind": "127.0.0.1:0"}]
 
 #: Bytes that the process may use beyond the configured limits: the objects and buffers of a
@@ -85,7 +85,10 @@ class Server:
             acl=ACL,
             broker={
                 "audit": {"path": "audit.log", "size": "1 MiB", "keep": 1},
-                "listeners": [{"bind": "127.0.0.1:0", "protocol": "websocket"}, *LISTENERS],
+                "listeners": [
+                    *({"bind": "127.0.0.1:0", "protocol": kind} for kind in ("websocket", "web")),
+                    *LISTENERS,
+                ],
             },
         )
         self._audit = directory / "audit.log"
@@ -170,9 +173,12 @@ class Server:
         self._witness = witness = self._witness or Witness()
         self._attacker = attacker = self._attacker or Attacker()
         ports = appliance.port, appliance.plain_port
-        web_ports = re.findall(r"listening for WebSocket on \S+:(\d+)$", appliance.log, re.M)
+        web_port, http_port = (
+            int(re.findall(rf"listening for {kind} on \S+:(\d+)$", appliance.log, re.M)[-1])
+            for kind in ("WebSocket", "the web")
+        )
         passwords = dict(appliance.passwords)
-        target = Target(*ports, appliance.ca, passwords, int(web_ports[-1]))
+        target = Target(*ports, appliance.ca, passwords, web_port, http_port)
         witness.begin(target, ways[0])
         base = _status(appliance.pid, "VmRSS")
         # The peak is counted from here on; see proc(5), clear_refs.

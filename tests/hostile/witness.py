@@ -48,6 +48,7 @@ class Target:
     ca: Path
     passwords: dict[str, str]
     web_port: int = 0
+    http_port: int = 0
 
     def port_of(self, over: Over) -> int:
         ports = {Over.PLAIN: self.plain_port, Over.TLS: self.port, Over.WEBSOCKET: self.web_port}
