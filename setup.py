@@ -28,6 +28,25 @@ INTERPRETED = {
     Path("appliance/mqtt/packets.py"),
 }
 
+# Of the link to a fleet's broker: what runs for every message of its backlog, and what that calls.
+UPSTREAM = (
+    "backlog",
+    "backlog_counts",
+    "channel",
+    "disk_room",
+    "latest_values",
+    "late",
+    "link",
+    "live_messages",
+    "publish_properties",
+    "rates",
+    "receipts",
+    "records",
+    "rule_queue",
+    "sender",
+    "user_shares",
+)
+
 
 def compiled() -> None:
     """Set up with the data path compiled: what is pure and typed, and runs for every message."""
@@ -38,6 +57,7 @@ def compiled() -> None:
         return
     modules = {*Path("appliance/mqtt").glob("*.py"), *Path("appliance/broker").glob("*.py")}
     modules |= {Path(f"appliance/net/{name}.py") for name in ("connection", "scheduler", "tls")}
+    modules |= {Path(f"appliance/upstream/{name}.py") for name in UPSTREAM}
     modules = {module for module in modules if module.name != "__init__.py"} - INTERPRETED
     level = os.environ.get("APPLIANCE_OPTIMIZE", "3")
     extensions = mypycify(sorted(map(str, modules)), opt_level=level, group_name="appliance")

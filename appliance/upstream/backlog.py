@@ -76,9 +76,10 @@ KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
 #: Bytes of memory: of messages in flight, and of records that were read. With those of
-#: `LiveMessages`, and what a higher lane gets in addition, it is 8 MiB a link.
+#: `LiveMessages`, and what a higher lane gets in addition, it is 8 MiB a link. What is not `Final`
+#: here tests replace, also in the compiled build.
 IN_FLIGHT_SIZE: Final = 3 * MIB
-LOADED_SIZE: Final = 5 * MIB // 4
+LOADED_SIZE = 5 * MIB // 4
 
 #: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
 #: higher lane would wait for all of them. However many wait to be tried again, each rule of which
@@ -86,7 +87,7 @@ LOADED_SIZE: Final = 5 * MIB // 4
 IN_FLIGHT_RESERVE: Final = 256 * KIB
 
 #: Bytes of read records that a rule has at least, however many rules there are.
-LOADED_SHARE: Final = 32 * KIB
+LOADED_SHARE = 32 * KIB
 
 #: After so many messages of other lanes it is a lane's turn. Both lower lanes may have waited, so
 #: that each gets one in 16.
@@ -94,7 +95,7 @@ TURN: Final = 14
 
 #: Messages of a rule that wait to be tried again (0x97); with more, no other of that rule is sent
 #: until one is due. Other rules go on: the fleet's broker may refuse one user's topics only.
-MOST_LATER: Final = 100
+MOST_LATER = 100
 
 #: Seconds until a message is tried again; doubled each time up to the second value.
 FIRST_RETRY: Final = 1.0
@@ -714,7 +715,7 @@ class Backlog:
         if held is not None:
             self._end_passes(held)
             more = packet_size > self._held_at
-            held.passes = held.messages if more else len(held.again)
+            held.passes = float(held.messages if more else len(held.again))
             if more:
                 self._held_before, self._held_at = self._held_at, math.inf
 
@@ -723,7 +724,7 @@ class Backlog:
         if held.passes > 0:
             self._held_at = min(self._held_at, self._held_before)
         self._held_before = math.inf
-        held.passes = 0
+        held.passes = 0.0
 
     def next(self, now: float) -> Entry | None:
         """The next message to be sent; None when there is none, or when it may not be sent yet.
@@ -882,7 +883,7 @@ class Backlog:
         for _ in range(MOST_DROPPED):
             stored: RuleQueue | None = None
             live: RuleQueue | None = None
-            live_number = math.inf
+            live_number = 0
             for queue in self._lanes[lane]:
                 if not queue.messages or not queue.passes:
                     continue
@@ -916,7 +917,7 @@ class Backlog:
                     not is_refused
                     and (latest.ready or queue.live)
                     and (number := queue.first_live_number()) is not None
-                    and number < live_number
+                    and (live is None or number < live_number)
                 ):
                     live, live_number = queue, number
             if live is not None and (stored is None or self._live_first[lane]):
@@ -1245,8 +1246,8 @@ class Backlog:
             self._postpone(entry, now)
             return True
         if not held.messages:
-            held.passes = 0
-            self._held_at = packet_size
+            held.passes = 0.0
+            self._held_at = float(packet_size)
             self._sort()
         self._held_at = min(self._held_at, packet_size)
         record = entry.record

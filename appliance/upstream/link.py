@@ -427,7 +427,7 @@ class FleetConnection(Generic[T]):
                         events.append(arrived)
                 else:
                     self._on_packet(event, now, events)
-                    if self.ended is not None:
+                    if self._has_ended():
                         break
         except ProtocolError as error:
             self._fail(error.code, str(error))
@@ -450,9 +450,9 @@ class FleetConnection(Generic[T]):
         if left != self._left or not unsent:
             self._left, self._left_at = left, now
         due = self._patience(now)
-        if self.ended is None:
+        if not self._has_ended():
             due = min(due, self._keep_alive(now))
-        self._due = due if self.ended is None else math.inf
+        self._due = math.inf if self._has_ended() else due
         return self._due
 
     def _patience(self, now: float) -> float:
@@ -802,6 +802,11 @@ class FleetConnection(Generic[T]):
         code = ReasonCode.UNSPECIFIED_ERROR
         ending = Ending(EndedBy.NETWORK, code, text, self.granted is None, is_silent=True)
         self._end(ending, notify=False)
+
+    def _has_ended(self) -> bool:
+        """Asked after a call that may end it: mypyc takes what was known of `ended` before the call
+        for certain."""
+        return self.ended is not None
 
     def _end(self, ending: Ending, *, notify: bool) -> None:
         if self.ended is not None:

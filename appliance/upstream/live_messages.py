@@ -36,14 +36,15 @@ log = logging.getLogger(__name__)
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
-#: Bytes of memory: of latest messages, and of them and what is forgotten with the connection.
-LATEST_SIZE: Final = 3 * MIB
+#: Bytes of memory: of latest messages, and of them and what is forgotten with the connection. What
+#: is not `Final` here tests replace, also in the compiled build.
+LATEST_SIZE = 3 * MIB
 LIVE_SIZE: Final = 7 * MIB // 2
 
 #: Bytes of the topics of which the latest message is only on disk; with more, the oldest are
 #: dropped. And of such messages that are read, see `LiveMessages.read`.
-TOPICS_SIZE: Final = 32 * MIB
-VALUES_SIZE: Final = 256 * KIB
+TOPICS_SIZE = 32 * MIB
+VALUES_SIZE = 256 * KIB
 VALUES_AT_ONCE: Final = 32
 
 

@@ -18,9 +18,16 @@ ROOT = Path(__file__).parents[2]
 #: The tests of what is compiled, as far as they run in their own process. Of what is random a few
 #: examples are enough, of what is lengthy none, and of two event loops the appliance's own.
 TESTS = ["tests/broker", "tests/mqtt", "tests/net/test_tls.py", "tests/net/test_websocket.py"]
+UPSTREAM = ("backlog", "backlog_random", "link", "publish_properties", "rates", "records", "uplink")
+TESTS += [f"tests/upstream/test_{name}.py" for name in UPSTREAM]
 
-#: Prints where two of the compiled modules come from.
-WHERE = "from appliance.broker import client; from appliance.net import tls; print(client, tls)"
+#: Prints where some of the compiled modules come from.
+WHERE = """
+from appliance.broker import client
+from appliance.net import tls
+from appliance.upstream import backlog
+print(client, tls, backlog)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +61,7 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
     environment = {**os.environ, "PYTHONPATH": str(compiled), "TEST_EXAMPLES": "0.03"}
     where = [sys.executable, "-c", WHERE]
     used = subprocess.run(where, env=environment, cwd=compiled, check=True, capture_output=True)
-    assert used.stdout.count(b".so") == 2
+    assert used.stdout.count(b".so") == 3
     pytest_command = Path(sys.executable).with_name("pytest")  # `-m pytest` would import from here
     run = subprocess.run(
         [

@@ -125,7 +125,7 @@ async def test_what_is_published_while_a_link_is_reloaded_is_not_lost(tmp_path: 
             assert not fleet.faults
 
 
-@pytest.mark.parametrize("failing", [False, True])
+@pytest.mark.parametrize("failing", [False, pytest.param(True, marks=pytest.mark.patches)])
 async def test_a_reload_loses_what_cannot_be_stored_and_the_link_before_is_freed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: bool
 ) -> None:

@@ -16,6 +16,9 @@ from appliance.upstream.sender import Sender
 from upstream.links import link as settings_of
 from upstream.test_backlog import Link
 
+#: A compiled sender takes no other connection than its own.
+pytestmark = pytest.mark.patches
+
 
 class Connection:
     """Takes what it is sent: topic, QoS and user properties."""

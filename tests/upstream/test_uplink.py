@@ -392,6 +392,7 @@ async def test_rules_with_offline_keep_have_a_session_that_the_fleet_keeps(tmp_p
         assert "fleet/r2d2/mission/#" not in filters["r2d2"]
 
 
+@pytest.mark.patches
 async def test_a_silent_fleet_is_noticed_though_most_rounds_check_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -431,6 +432,7 @@ async def test_a_full_backlog_says_no_where_it_should(tmp_path: Path) -> None:
             assert len(payloads(fleet, "fleet/r2d2/events/door")) == taken
 
 
+@pytest.mark.patches
 async def test_while_the_disk_stands_still_memory_is_bounded_and_nothing_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
