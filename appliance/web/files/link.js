@@ -117,6 +117,11 @@ function takeAbout(told) {
   robots.value = found
 }
 
+const NAMES_PERIOD = 500 // ms between two times that a page goes through all names
+
+const fresh = [] // names that are not among the others yet
+let named = 0
+
 const held = [] // rows that came while the page was paused
 
 export function pause(paused) {
@@ -126,17 +131,18 @@ export function pause(paused) {
 }
 
 function takeRows(told) {
-  const more = []
   for (const [topic, text, size, rate, at, retain] of told) {
     const row = { text, size, rate, at, retain }
     const known = rows.get(topic)
     if (known) known.value = row
     else {
       rows.set(topic, signal(row))
-      more.push(topic)
+      fresh.push(topic)
     }
   }
-  if (more.length) names.value = [...names.peek(), ...more].sort() // nearly sorted: that is quick
+  if (fresh.length === 0 || performance.now() - named < NAMES_PERIOD) return
+  names.value = [...names.peek(), ...fresh.splice(0)].sort() // nearly sorted: that is quick
+  named = performance.now()
 }
 
 /** Load the page anew: whoever signs in next finds nothing of this user in its memory. */
