@@ -97,10 +97,13 @@ class WebSite:
 
 
 def _has_foreign_origin(request: HttpRequest) -> bool:
-    """Whether a page of another site has the browser ask; who is no browser sends no Origin."""
+    """Whether a page of another site has the browser ask; who is no browser sends no Origin.
+
+    On a listener without TLS a proxy may have added that, and its page's Origin says https.
+    """
     given = [value.lower() for name, value in request.headers if name == "origin"]
-    scheme = "http" if request.tls is None else "https"
-    return bool(given) and given != [f"{scheme}://{request.host}".lower()]
+    schemes = ("http", "https") if request.tls is None else ("https",)
+    return bool(given) and given not in [[f"{each}://{request.host}".lower()] for each in schemes]
 
 
 def is_named(host: str, names: Collection[str]) -> bool:

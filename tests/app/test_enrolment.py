@@ -157,6 +157,7 @@ async def test_what_is_no_enrolment(web: WebApp):
         (given(""), 400),
         (given(code) | {"Origin": "https://elsewhere.example"}, 403),
         (given(code) | {"Origin": "null"}, 403),
+        (given(code) | {"Origin": "http://localhost"}, 403),
         (given("x" * 5000), 403),
         (given(code.swapcase()), 403),
     ):
