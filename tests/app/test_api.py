@@ -242,7 +242,7 @@ async def test_bad_bodies(web: WebApp):
 
 
 async def test_values_that_are_more_work_than_their_bytes(web: WebApp):
-    """All others would wait for half a second while they are read."""
+    """All others would wait for a tenth of a second while they are read."""
     lists = b'{"topic": "r2d2/a", "payload": [%s[]]}' % (b"[]," * 300_000)
     text = b'{"topic": "r2d2/a", "payload": "%s"}' % (b"[]," * 300_000)
     for path in ("publish", "call"):

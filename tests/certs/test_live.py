@@ -115,12 +115,15 @@ def make(directory: Path, **tls: Any) -> ApplianceProcess:
     listeners = [
         {"bind": "127.0.0.1:0", "tls": True},
         {"bind": "127.0.0.1:0", "tls": True, "client_certificates": "required"},
-        {
-            "bind": "127.0.0.1:0",
-            "tls": True,
-            "client_certificates": "optional",
-            "protocol": "websocket",
-        },
+        *(
+            {
+                "bind": "127.0.0.1:0",
+                "tls": True,
+                "client_certificates": "optional",
+                "protocol": protocol,
+            }
+            for protocol in ("websocket", "web")
+        ),
         {"bind": "127.0.0.1:0"},
     ]
     process = ApplianceProcess(
@@ -156,8 +159,9 @@ def running(directory: Path) -> Iterator[ApplianceProcess]:
 
 
 def _ports(process: ApplianceProcess) -> list[int]:
-    """With TLS, with TLS and a certificate required, for WebSocket with TLS, without TLS."""
-    process.wait_for_log(r"listening ", 4)
+    """With TLS, with TLS and a certificate required, for WebSocket and the web with TLS, without
+    TLS."""
+    process.wait_for_log(r"listening ", 5)
     return [int(port) for port in re.findall(r"listening .*on \S+:(\d+)", process.log)]
 
 
@@ -426,6 +430,34 @@ def test_revoked_over_websocket(process: ApplianceProcess) -> None:
                 pass
     with pytest.raises((ssl.SSLError, ConnectionError, EOFError, WebSocketException)), dial():
         pass
+
+
+def test_revoked_over_http(process: ApplianceProcess) -> None:
+    """Neither a connection that was kept goes on, nor a body that is on its way, nor a new one."""
+    port, context = _ports(process)[3], context_of(process, "tablet")
+    body = b'{"topic": "r2d2/tablet/x", "payload": 1}'
+    post = (
+        b"POST /api/v1/publish HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+        b"Content-Length: %d\r\n\r\n" % len(body)
+    )
+
+    def dial() -> ssl.SSLSocket:
+        plain = socket.create_connection((HOST, port), PATIENCE)
+        return context.wrap_socket(plain, server_hostname=HOST)
+
+    with dial() as kept, dial() as slow:
+        kept.sendall(post + body)
+        assert kept.recv(4096).startswith(b"HTTP/1.1 200 ")
+        slow.sendall(post + body[:-1])
+        process.wait_for_log(r"client '.*' \(user 'tablet'\) at .* connected", 2)
+        certs.revoke(process.directory / "certs", "tablet")
+        os.kill(process.pid, signal.SIGHUP)
+        for each in (kept, slow):
+            assert each.recv(4096) == b""
+    with pytest.raises((ssl.SSLError, ConnectionError)), dial() as again:
+        again.sendall(post + body)
+        assert not again.recv(4096)
+        raise ConnectionError  # in TLS 1.3 it may be told as late as this
 
 
 def test_the_servers_certificate_is_replaced_under_load(process: ApplianceProcess) -> None:
