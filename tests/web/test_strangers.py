@@ -10,6 +10,7 @@ import pytest
 from appliance_process import ROBOT, ApplianceProcess
 from interop.paho_peer import V5, Peer
 from visits import DESKTOP, Visit
+from waiting import eventually
 
 pytest.importorskip("rclpy")
 pytest.importorskip("playwright.sync_api")
@@ -82,3 +83,45 @@ def test_a_filter_is_not_a_topic(visit: Callable[..., Visit]) -> None:
     page.click("button:has-text('Open')")
     assert page.evaluate("document.querySelector('input[name=topic]').validity.patternMismatch")
     assert page.evaluate("location.hash") == "#/publish"
+
+
+#: Count what the page is told of these topics.
+COUNT_TOLD = """() => {
+  globalThis.told = new Set()
+  globalThis.Worker = class extends Worker {
+    constructor(...values) {
+      super(...values)
+      this.addEventListener('message', ({ data }) => {
+        for (const [topic] of data.answer?.rows ?? []) {
+          if (topic.startsWith('other/once/')) told.add(topic)
+        }
+      })
+    }
+  }
+}"""
+
+
+def test_what_comes_while_a_page_is_paused_is_there_afterwards(
+    visit: Callable[..., Visit], appliance: ApplianceProcess
+) -> None:
+    """All of it, though each topic came once; and no other page is paused."""
+    count = 6000
+    visited = visit(**DESKTOP)
+    visited.page.evaluate(COUNT_TOLD)
+    page = visited.sign_in(page="Topics")
+    page.click(".list button:has-text('Pause')")
+    page.wait_for_selector(".list button:has-text('Continue')")
+    with Peer(appliance, V5, user="stranger") as peer:
+        for number in range(count):
+            peer.client.publish(f"other/once/{number}", b"1", retain=True)
+        eventually(lambda: page.evaluate("told.size") == count, "all to have come")
+        page.fill("input[type=search]", "other/once/")
+        page.wait_for_selector("[role=status]:text-is('0 topics')")
+        page.click("nav a:has-text('Health')")
+        page.wait_for_selector("h1:has-text('Health')")
+        page.click("nav a:has-text('Topics')")
+        page.wait_for_selector(".list button:has-text('Pause')")
+        page.wait_for_selector(f"[role=status]:text-is('{count} topics')")
+        for number in range(count):
+            peer.client.publish(f"other/once/{number}", b"", retain=True)
+        peer.publish("other/last", b"", qos=1)

@@ -97,8 +97,7 @@ function take(told) {
     if (told.token !== null && user.peek()) keep(told.token)
     if (untold.peek() !== told.untold) untold.value = told.untold
     if (!isPaused.peek()) takeRows(told.rows)
-    else held.push(...told.rows.slice(0, 1000))
-    if (held.length > 5000) held.splice(0, held.length - 5000)
+    else for (const row of told.rows) held.set(row[0], row)
     if (told.shelf?.run === shelving) takeShelf(told.shelf)
     if (told.focus) {
       inspected.peek()?.bitmap?.close()
@@ -122,12 +121,14 @@ const NAMES_PERIOD = 500 // ms between two times that a page goes through all na
 const fresh = [] // names that are not among the others yet
 let named = 0
 
-const held = [] // rows that came while the page was paused
+const held = new Map() // topic → its newest row, of those that came while the page was paused
 
 export function pause(paused) {
   isPaused.value = paused
   tell('pause', { paused })
-  if (!paused) batch(() => takeRows(held.splice(0)))
+  if (paused) return
+  batch(() => takeRows([...held.values()]))
+  held.clear()
 }
 
 function takeRows(told) {

@@ -18,6 +18,7 @@ export default function Topics({ topic }) {
     focus(topic)
     return () => focus('')
   }, [topic])
+  useEffect(() => () => { if (isPaused.peek()) pause(false) }, []) // other pages have no button for it
   return html`<div class=${`topics ${topic ? 'inspecting' : ''}`}>
     <div class="list"><h1>Topics</h1><${Tree} topic=${topic} /></div>
     ${topic && html`<${Inspector} key=${topic} topic=${topic} />`}
