@@ -77,9 +77,9 @@ _ACKNOWLEDGEMENTS: dict[int, tuple[int, frozenset[ReasonCode]]] = {
     0x70: (PUBCOMP, Pubcomp.REASONS),
 }
 
-#: The beginning of a PUBACK without reason code, and its size in bytes.
-_PUBACK = b"\x40\x02"
-_PUBACK_SIZE = 4
+#: What follows the packet id in a PUBACK, by its first two bytes: nothing, or the reason code No
+#: matching subscribers, also with the length of no properties.
+_PUBACKS = {b"\x40\x02": b"", b"\x40\x03": b"\x10", b"\x40\x04": b"\x10\x00"}
 
 #: The largest acknowledgement without properties, in bytes: smaller than any packet size limit that
 #: is of use.
@@ -114,34 +114,40 @@ class ClientProtocol(PacketFramer):
         #: Whether the client has sent AUTH with Re-authenticate, and has no answer to it yet.
         self.reauthenticating = False
 
-    def take_pubacks(self, data: bytes) -> tuple[Sequence[int], bytes]:
-        """The packet ids of the PUBACKs without reason code that come first, and the rest of
-        `data`, which is for `receive_data`.
+    def take_pubacks(self, data: bytes) -> tuple[Sequence[int], int, bytes]:
+        """The packet ids of the PUBACKs of one form that come first, their reason code, and the
+        rest of `data`, which is for `receive_data`.
 
         The events would be the same. But a server that is sent many messages answers with nothing
-        else, and these are taken apart all at once.
+        else, Success or No matching subscribers, and these are taken apart all at once.
         """
-        if self._have:
-            if self._have >= _PUBACK_SIZE or self._chunks[0][0] != _PUBACK[0]:
-                return (), data
-        elif data[:2] != _PUBACK:
-            return (), data
-        if not self._reading or self.state is not State.CONNECTED:
-            return (), data
+        nothing = (), 0, data
+        if not self._reading or self.state is not State.CONNECTED or self._have >= _SHORT:
+            return nothing
         whole = b"".join([*self._chunks, data]) if self._have else data
-        end = len(whole) // _PUBACK_SIZE * _PUBACK_SIZE
-        firsts, sizes = whole[0:end:_PUBACK_SIZE], whole[1:end:_PUBACK_SIZE]
-        count = end // _PUBACK_SIZE
-        count -= max(len(firsts.lstrip(_PUBACK[:1])), len(sizes.lstrip(_PUBACK[1:])))
-        packet_ids = array("H", whole[: count * _PUBACK_SIZE])
+        head = whole[:2]
+        tail = _PUBACKS.get(head)
+        if tail is None or (tail and self.version != V5):
+            return nothing
+        size = 4 + len(tail)
+        if self._have >= size:
+            return nothing
+        total = count = len(whole) // size
+        end = total * size
+        for place, byte in ((0, head[:1]), (1, head[1:]), (4, tail[:1]), (5, tail[1:])):
+            if byte:
+                count = min(count, total - len(whole[place:end:size].lstrip(byte)))
+        end = count * size
+        joined = bytearray(2 * count)
+        joined[0::2], joined[1::2] = whole[2:end:size], whole[3:end:size]
+        packet_ids = array("H", bytes(joined))
         if sys.byteorder == "little":
             packet_ids.byteswap()
-        packet_ids = packet_ids[1::2]
         if not packet_ids or 0 in packet_ids:
-            return (), data
+            return nothing
         self._chunks.clear()
         self._have = 0
-        return packet_ids, whole[count * _PUBACK_SIZE :]
+        return packet_ids, tail[0] if tail else 0, whole[end:]
 
     def _check(self, first: int, size: int) -> None:
         """Raise ProtocolError if a packet of this type or size is not allowed now."""

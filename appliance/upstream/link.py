@@ -397,9 +397,9 @@ class FleetConnection(Generic[T]):
         tokens: list[T] = []
         last = -1  # the acknowledgement that `tokens` belongs to
         try:
-            packet_ids, data = self._protocol.take_pubacks(data)
+            packet_ids, code, data = self._protocol.take_pubacks(data)
             if packet_ids:
-                last = 0
+                last = code
                 events.append(Acknowledged(tokens, last))
                 for packet_id in packet_ids:
                     entry = inflight.pop(packet_id, None)

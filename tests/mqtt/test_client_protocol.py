@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 from examples import examples
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from test_connection import (
     SAYABLE,
@@ -471,16 +471,24 @@ def test_properties_of_an_acknowledgement_are_decoded():
 
 
 BETWEEN = [b"\x40\x03\x00\x01\x10", b"\xd0\x00", b"\x40\x04\x00\x02\x00\x00", b"\x70\x02\x00\x03"]
+FORMS = [(b"\x40\x02", b""), (b"\x40\x03", b"\x10"), (b"\x40\x04", b"\x10\0")]
 RUNS = st.lists(
-    st.lists(st.integers(1, 65535), min_size=1, max_size=20).map(
-        lambda ids: b"".join(b"\x40\x02" + each.to_bytes(2, "big") for each in ids)
+    st.builds(
+        lambda form, ids: b"".join(form[0] + each.to_bytes(2, "big") + form[1] for each in ids),
+        st.sampled_from(FORMS),
+        st.lists(st.integers(1, 65535), min_size=1, max_size=20),
     )
     | st.sampled_from(BETWEEN),
     max_size=6,
 ).map(b"".join)
 
 
-@given(RUNS, st.binary(max_size=3) | st.just(b"\x40\x02\x00\x00"), st.lists(st.integers(0, 300)))
+WRONG = [b"\x40\x02\0\0", b"\x40\x03\0\0\x10", b"\x40\x03\0\1\x87", b"\x40\x04\0\1\x10\1"]
+
+
+@example(b"", WRONG[0], [])
+@example(b"", WRONG[3], [])
+@given(RUNS, st.binary(max_size=5) | st.sampled_from(WRONG), st.lists(st.integers(0, 300)))
 def test_pubacks_that_are_taken_at_once_are_the_same(data: bytes, end: bytes, cuts: list[int]):
     """As those that `receive_data` yields, however the bytes arrive; and so is what follows."""
 
@@ -490,8 +498,9 @@ def test_pubacks_that_are_taken_at_once_are_the_same(data: bytes, end: bytes, cu
             for start, stop in itertools.pairwise([0, *sorted(cuts), len(data) + len(end)]):
                 part = (data + end)[start:stop]
                 if taking:
-                    packet_ids, part = client.take_pubacks(part)
-                    events += [PacketType.PUBACK << 16 | each for each in packet_ids]
+                    packet_ids, code, part = client.take_pubacks(part)
+                    kind = code << 24 | PacketType.PUBACK << 16
+                    events += [kind | each for each in packet_ids]
                 events += client.receive_data(part)
                 assert not taking or client.held <= len(data + end)
         except ProtocolError as error:
@@ -503,9 +512,20 @@ def test_pubacks_that_are_taken_at_once_are_the_same(data: bytes, end: bytes, cu
 
 def test_pubacks_are_taken_only_after_connack():
     client = started()
-    assert client.take_pubacks(b"\x40\x02\x00\x01") == ((), b"\x40\x02\x00\x01")
+    assert client.take_pubacks(b"\x40\x02\x00\x01") == ((), 0, b"\x40\x02\x00\x01")
     client = connected()
-    packet_ids, rest = client.take_pubacks(b"\x40\x02\x12\x34\x40\x02\x00\x02\x40\x02\x00")
-    assert (list(packet_ids), rest) == ([0x1234, 2], b"\x40\x02\x00")
+    packet_ids, code, rest = client.take_pubacks(b"\x40\x02\x12\x34\x40\x02\x00\x02\x40\x02\x00")
+    assert (list(packet_ids), code, rest) == ([0x1234, 2], 0, b"\x40\x02\x00")
     client.pause()
-    assert client.take_pubacks(b"\x40\x02\x00\x01") == ((), b"\x40\x02\x00\x01")
+    assert client.take_pubacks(b"\x40\x02\x00\x01") == ((), 0, b"\x40\x02\x00\x01")
+
+
+@pytest.mark.parametrize("end", [b"", b"\0"], ids=["code", "code-and-length"])
+def test_pubacks_of_messages_that_nobody_subscribes_to_are_taken_at_once(end: bytes):
+    size = bytes((3 + len(end),))
+    data = b"".join(b"\x40" + size + bytes((1, each)) + b"\x10" + end for each in range(100))
+    packet_ids, code, rest = connected().take_pubacks(data + b"\x40\x02\x00\x01")
+    assert (list(packet_ids), code) == ([0x100 + each for each in range(100)], 0x10)
+    assert rest == b"\x40\x02\x00\x01"
+    old = connected(4)
+    assert old.take_pubacks(data) == ((), 0, data)  # of 3.1.1, which has no reason codes
