@@ -31,9 +31,9 @@ const order = signal({ by: 'ros', isDown: false })
 export function useRoutes() {
   const told = useShelf(LIVE)
   const live = useMemo(() => figuresOf(told.topics), [told.topics])
-  const all = [...robots.value].flatMap(([robot, { routes = [] }]) => routes
+  const all = useMemo(() => [...robots.value].flatMap(([robot, { routes = [] }]) => routes
     .filter(({ direction }) => WAYS.includes(direction))
-    .map((route) => plain({ ...route, ...live.get(`${robot} ${keyOf(route)}`), robot, key: keyOf(route) })))
+    .map((route) => plain({ ...route, ...live.get(robot)?.get(keyOf(route)), robot, key: keyOf(route) }))), [robots.value, live])
   return { all, told }
 }
 
@@ -50,16 +50,22 @@ function keyOf({ direction, mqtt }) {
   return `${direction === 'to_ros' ? '<' : '>'}${mqtt}`
 }
 
+const read = new WeakMap() // what is kept of a robot → its figures, so that each is read once
+
+/** The figures of the last second, by robot and then by route. */
 function figuresOf(topics) {
+  return new Map([...topics].map(([topic, entry]) => {
+    if (!read.has(entry)) read.set(entry, figuresIn(entry.text))
+    return [topic.slice(0, topic.indexOf('/')), read.get(entry)]
+  }))
+}
+
+function figuresIn(text) {
   const found = new Map()
-  for (const [topic, entry] of topics) {
-    const robot = topic.slice(0, topic.indexOf('/'))
-    const said = valueOf(entry.text)
-    if (!Array.isArray(said?.routes)) continue
-    for (const route of said.routes) {
-      if (typeof route?.mqtt !== 'string') continue
-      found.set(`${robot} ${keyOf(route)}`, Object.fromEntries(FIGURES.map((name) => [name, route[name]])))
-    }
+  const routes = valueOf(text)?.routes
+  for (const route of Array.isArray(routes) ? routes : []) {
+    if (typeof route?.mqtt !== 'string') continue
+    found.set(keyOf(route), Object.fromEntries(FIGURES.map((name) => [name, route[name]])))
   }
   return found
 }
@@ -79,7 +85,7 @@ function List({ all }) {
   const found = all.filter((route) => (!way.value || route.direction === way.value)
     && words.every((word) => `${route.ros} ${route.mqtt} ${route.type}`.toLowerCase().includes(word)))
   const { by, isDown } = order.value
-  const compare = ({ [by]: one }, { [by]: other }) => (NUMBERS.has(by) ? (one ?? -1) - (other ?? -1) : one.localeCompare(other))
+  const compare = ({ [by]: one = -1 }, { [by]: other = -1 }) => (one > other) - (one < other)
   found.sort((one, other) => (isDown ? compare(other, one) : compare(one, other)))
   const sort = (name) => { order.value = { by: name, isDown: by === name ? !isDown : NUMBERS.has(name) } }
   return html`
