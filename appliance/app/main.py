@@ -496,7 +496,8 @@ class App:
             log.error("`appliance status`, `reload` and `routes` are not answered: %s", error)
         self._stack.push_async_callback(control.stop)
         if settings.reload_on_change:
-            self._run_in_background(partial(watch, self._reload.files, self._try_reload))
+            read_at = settings.read_at
+            self._run_in_background(partial(watch, self._reload.files, self._try_reload, read_at))
 
     def request_stop(self) -> None:
         """Make `run` return."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -82,6 +83,7 @@ def load(path: Path | None = None) -> Settings:
     an administrator does not have them.
     """
     file = find(path)
+    began = time.time()
     try:
         with file.open(encoding="utf-8") as opened:
             text = opened.read(_MAX_SIZE + 1)
@@ -91,7 +93,9 @@ def load(path: Path | None = None) -> Settings:
     if len(text) > _MAX_SIZE:
         what = f"longer than {_MAX_SIZE >> 20} Mi characters: is it the right file?"
         raise ConfigError([ConfigProblem(file, 0, "", what)])
-    return loads(text, file, {**of_service(file), **os.environ})
+    settings = loads(text, file, {**of_service(file), **os.environ})
+    settings._read_at = began
+    return settings
 
 
 def load_control(path: Path | None = None) -> Settings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -695,8 +696,14 @@ class Settings(_Section):
     reload_on_change: bool = True
     crash_reports: OptionalPath = Field(Path("state/crashes"), validate_default=True)
     _file: Path | None = PrivateAttr(default=None)
+    _read_at: float = PrivateAttr(default_factory=time.time)
 
     @property
     def file(self) -> Path | None:
         """The file that these settings were read from; None when they were made in code."""
         return self._file
+
+    @property
+    def read_at(self) -> float:
+        """When the file was read, in seconds of `time.time`: what it says now may be newer."""
+        return self._read_at

@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -154,8 +155,17 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
             process.start()
 
 
+def hang_up(file: Path) -> None:
+    os.kill(os.getpid(), signal.SIGHUP)
+
+
+def edit(file: Path) -> None:
+    file.write_text(file.read_text() + "log: {level: debug}\n")
+
+
+@pytest.mark.parametrize("ask", [hang_up, edit])
 def test_a_reload_during_the_start_comes_after_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ask: Callable[[Path], None]
 ) -> None:
     file = tmp_path / "appliance.yaml"
     file.write_text(
@@ -168,7 +178,7 @@ def test_a_reload_during_the_start_comes_after_it(
     reloaded: list[object] = []
 
     async def start(app: App) -> None:
-        os.kill(os.getpid(), signal.SIGHUP)
+        ask(file)
         await own(app)
 
     async def reload(app: App) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from pathlib import Path
 
 import pytest
@@ -35,9 +36,10 @@ class Watched:
 
 
 @contextlib.asynccontextmanager
-async def watching(*files: Path):
+async def watching(*files: Path, since: float | None = None):
     watched = Watched(*files)
-    task = asyncio.create_task(watch(lambda: watched.files, watched.changed))
+    began = time.time() if since is None else since
+    task = asyncio.create_task(watch(lambda: watched.files, lambda: watched.changed(), began))
     await asyncio.sleep(0.5)  # until it has begun
     try:
         yield watched
@@ -58,6 +60,49 @@ def replace(path: Path) -> None:
 
 def remove(path: Path) -> None:
     path.unlink()
+
+
+async def test_what_changed_before_the_watch_began_is_told_of_once(tmp_path: Path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    old.write_text("as it was read")
+    await asyncio.sleep(0.1)
+    since = time.time()
+    async with watching(old, new, since=since) as watched:
+        assert not await watched.told(3 * NEVER)
+    new.write_text("while the appliance started")
+    async with watching(old, new, since=since) as watched:
+        assert await watched.told()
+        assert not await watched.told(3 * NEVER)
+
+
+async def test_a_file_in_a_folder_that_comes_later(tmp_path: Path):
+    path = tmp_path / "later" / "file"
+    async with watching(tmp_path / "file", path) as watched:
+        path.parent.mkdir()
+        path.write_text("")
+        assert await watched.told()
+
+
+async def test_what_changes_while_a_change_is_taken(tmp_path: Path):
+    """And makes that others are watched: nothing of it is lost."""
+    first, second = tmp_path / "first", tmp_path / "more" / "second"
+    second.parent.mkdir()
+    async with watching(first) as watched:
+        taken = watched.changed
+
+        async def changed() -> None:
+            await taken()
+            if watched.calls == 1:
+                watched.files.append(second)
+                await asyncio.sleep(0.1)
+                first.write_text("again")
+                second.write_text("new")
+
+        watched.changed = changed
+        first.write_text("names the second")
+        assert await watched.told()
+        assert await watched.told()
+        assert not await watched.told(3 * NEVER)
 
 
 @pytest.mark.parametrize("change", [write, replace, remove])
