@@ -358,3 +358,30 @@ async def test_as_mqtt_it_is_audited_and_counted(web: WebApp):
     assert (await post(web, "publish", GOOD))[0] == 200
     assert web.app.broker.counters.connects == connects + 1
     await until(lambda: not web.app.broker.clients, "the client to leave")
+
+
+async def test_clients_that_go_in_the_middle_leave_nothing(web: WebApp):
+    """Two hundred at once: within the head, the body, the login and a call, and after all of it."""
+    assert (await post(web, "publish", GOOD))[0] == 200  # its password is known from now on
+    await until(lambda: not web.app.broker.clients, "the first client to leave")
+    scheduler = web.app._listeners.scheduler
+    kept = set(scheduler.connections)  # that of the first request
+    body = json.dumps({"topic": "$CONTROL/appliance/v1/status/_call"}).encode()
+    fields = {"Host": "localhost", "Content-Type": "application/json", **basic()}
+    fields["Content-Length"] = str(len(body))
+    lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    request = f"POST /api/v1/call HTTP/1.1\r\n{lines}\r\n".encode() + body
+    sent = [len(request), len(request) - 1, len(request) - len(body), 20]
+
+    async def begin(number: int) -> None:
+        peer = await web.dial()
+        await peer.send(request[: sent[number % len(sent)]])
+        for _ in range(number % 9):
+            await asyncio.sleep(0)
+        peer.hang_up()
+
+    await asyncio.gather(*(begin(number) for number in range(200)))
+    await until(lambda: scheduler.connections == kept, "all others to end")
+    assert not web.app.broker.clients
+    assert web.app.broker.accounting.accounts.connections == 0
+    assert (await post(web, "publish", GOOD))[0] == 200
