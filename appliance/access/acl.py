@@ -20,6 +20,9 @@ _FEW: Final = 4
 # A level that no rule can name, as no filter may hold U+0000 [MQTT-4.7.3-2].
 _FRESH: Final = "\0"
 
+# In a pattern the levels that are replaced by a client's names.
+_NAMES: Final = ("%c", "%u")
+
 _ONLY: Final = {Permission.READ: "gives read only", Permission.WRITE: "gives write only"}
 
 # The permission that an action needs; a subscription needs the right to read.
@@ -58,13 +61,13 @@ class _Group:
         self._always: list[int] = []
         for place, rule in enumerate(self.rules):
             levels = rule.filter.split("/")
-            named = rule.pattern and ("%c" in levels or "%u" in levels)
+            named = rule.pattern and any(name in levels for name in _NAMES)
             if named and rule.denies:  # With an unfit name it denies everything.
                 self._always.append(place)
                 continue
             level = self._root
             for name in levels:
-                key = "+" if named and name in ("%c", "%u") else name
+                key = "+" if named and name in _NAMES else name
                 level = level.below.setdefault(key, _Level())
             level.places.append(place)
 
@@ -120,6 +123,14 @@ class _Applied:
         if self.filter is None:
             return self.rule.denies
         return overlaps(self.filter, filter)
+
+    def why_passed(self, filter: str, otherwise: str) -> str:
+        """Why the rule does not apply: the name only where another one could make it match."""
+        if self.filter is not None:
+            return otherwise
+        levels = self.rule.filter.split("/")
+        could = "/".join("+" if name in _NAMES else name for name in levels)
+        return _UNFIT if overlaps(could, filter) else otherwise
 
     def __str__(self) -> str:
         return str(self.rule) if self.filter is not None else f"{self.rule} ({_UNFIT})"
@@ -284,7 +295,7 @@ class Acl:
             elif applied.matches(topic):
                 return ActionVerdict(action, not rule.denies, rule, str(applied), tuple(passed))
             else:
-                passed.append((rule, "does not match" if applied.filter is not None else _UNFIT))
+                passed.append((rule, applied.why_passed(topic, "does not match")))
         return ActionVerdict(
             action, False, None, self._no_rule(identity, action, topic), tuple(passed)
         )
@@ -306,10 +317,8 @@ class Acl:
                 continue
             if not rule.gives(needed):
                 passed.append((rule, _ONLY[rule.permission]))
-            elif applied.filter is None:
-                passed.append((rule, _UNFIT))
-            elif not applied.overlaps(wanted):
-                passed.append((rule, "shares no topic with the filter"))
+            elif applied.filter is None or not applied.overlaps(wanted):
+                passed.append((rule, applied.why_passed(wanted, "shares no topic with the filter")))
             else:
                 for topic in _samples(wanted, applied.filter, depth + 1):
                     # The client's own rules come before the patterns that deny.

@@ -274,8 +274,10 @@ class _AclReader:
         if filter:
             permission = _PERMISSIONS.get(word)
             if permission is None:
-                hint = "a filter with a space in it needs the access before it"
-                raise _LineError(start, _unknown("access", word, _PERMISSIONS) + f"; {hint}")
+                text = _unknown("access", word, _PERMISSIONS)
+                if not _near(word, _PERMISSIONS):
+                    text += "; a filter with a space in it needs the access before it"
+                raise _LineError(start, text)
         else:
             permission, filter = Permission.READWRITE, word
         column = len(line) - len(filter)
@@ -310,8 +312,13 @@ def _check_keyword(keyword: str, column: int) -> None:
     raise _LineError(column, _unknown("keyword", keyword, _KEYWORDS))
 
 
+def _near(word: str, known: Iterable[str]) -> list[str]:
+    """The one of them that was meant, if any."""
+    return difflib.get_close_matches(word.lower(), known, 1)
+
+
 def _unknown(what: str, word: str, known: Iterable[str]) -> str:
     known = list(known)
-    near = difflib.get_close_matches(word.lower(), known, 1)
+    near = _near(word, known)
     advice = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}"
     return f"unknown {what} {word!r}; {advice}"

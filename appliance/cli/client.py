@@ -5,14 +5,25 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from appliance.cli.connection import ConnectionOptions, connecting
 from appliance.cli.console import CommandError
 
+if TYPE_CHECKING:
+    from appliance.cli.mqtt_client import RefusedError
+
 _EXPLAINED = "On the robot, `appliance acl explain USER TOPIC` says which rule decides it."
+
+
+def _explained(error: RefusedError, user: str | None) -> CommandError:
+    """The refusal with the lines that would allow it or, where these are unknown, who tells."""
+    from appliance.cli.mqtt_client import lines_needed
+
+    advice = lines_needed(user, error.lines) if error.lines else _EXPLAINED
+    return CommandError(str(error.advised(advice)))
 
 
 @connecting
@@ -60,7 +71,7 @@ def pub(
     try:
         client.publish(connection.target(), topic, payloads, qos, retain, delay=repeat_delay)
     except client.RefusedError as error:
-        raise CommandError(str(error.advised(_EXPLAINED))) from None
+        raise _explained(error, connection.user) from None
     except client.ClientError as error:
         raise CommandError(str(error)) from None
 
@@ -107,7 +118,7 @@ def sub(
             timeout=timeout,
         )
     except client.RefusedError as error:
-        raise CommandError(str(error.advised(_EXPLAINED))) from None
+        raise _explained(error, connection.user) from None
     except client.ClientError as error:
         raise CommandError(str(error)) from None
     if count is not None and received < count:

@@ -6,10 +6,10 @@ import re
 import socket
 import ssl
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
@@ -18,9 +18,13 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from appliance.cli.arrivals import Arrivals
+from appliance.mqtt.topics import parse_shared
 from appliance.ops.logs import VISIBLE, VISIBLE_IN_LINES
 
 ANSWER_TIMEOUT = 10.0  # seconds to wait for an acknowledgement
+
+#: In the reason of the appliance's broker, where no line denies but one is missing.
+_NO_RULE: Final = ": no rule lets "
 
 
 class ClientError(Exception):
@@ -30,16 +34,26 @@ class ClientError(Exception):
 class RefusedError(ClientError):
     """The broker refused a request; the message has the broker's reason, if it gave one.
 
-    `by_rules`: its access rules may be the reason.
+    `by_rules`: its access rules may be the reason. `lines`: those that would allow it, as far as
+    the broker's reason says so: none helps against a line that denies.
     """
 
-    def __init__(self, message: str, *, by_rules: bool) -> None:
+    def __init__(self, message: str, *, by_rules: bool, lines: Sequence[str] = ()) -> None:
         super().__init__(message)
         self.by_rules = by_rules
+        self.lines = lines
 
     def advised(self, advice: str) -> RefusedError:
         """The same error, with advice on access rules if these may be the reason."""
         return RefusedError(f"{self}. {advice}", by_rules=True) if self.by_rules else self
+
+
+def lines_needed(user: str | None, lines: Sequence[str]) -> str:
+    """Which lines of the access rules the user lacks, and where they belong."""
+    quoted = " and ".join(f"`{line}`" for line in lines)
+    owner = f"below `user {user}`" if user else "below its `user` line"
+    what = "line that allows" if len(lines) == 1 else "lines that allow"
+    return f"The ACL {what} it: {quoted}, {owner} or in a group's file (groups/drivers.conf)"
 
 
 @dataclass(frozen=True)
@@ -62,6 +76,11 @@ class BrokerReply:
     def may_be_rules(self) -> bool:
         """Whether access rules may be the reason; MQTT 3.1.1 has one code for all refusals."""
         return self.code.value in (0x80, 0x87)
+
+    @property
+    def may_lack_line(self) -> bool:
+        """Whether one more access rule may help."""
+        return self.may_be_rules and (not self.why or _NO_RULE in self.why)
 
 
 @dataclass(frozen=True)
@@ -243,7 +262,8 @@ class MqttClient:
             # For QoS 2, paho reports only the end, and not the PUBREC with the reason string.
             hint = " (--qos 1 tells why)" if qos == 2 and not answer.why else ""
             text = f"{topic!r} was refused: {answer}{hint}"
-            raise RefusedError(text, by_rules=answer.may_be_rules)
+            lines = [f"topic write {topic}"] if answer.may_lack_line else []
+            raise RefusedError(text, by_rules=answer.may_be_rules, lines=lines)
         return answer.code
 
     def subscribe(self, filters: list[str], qos: int, *, retained: bool = True) -> None:
@@ -272,7 +292,11 @@ class MqttClient:
             text = "; ".join(f"{name!r} was refused: {answer.code}" for name, answer in refused)
             why = refused[0][1].why  # one for all of them
             by_rules = any(answer.may_be_rules for _, answer in refused)
-            raise RefusedError(f"{text}: {why}" if why else text, by_rules=by_rules)
+            # The one reason is about the first.
+            is_told = refused[0][1].may_lack_line
+            lacking = [name for name, reply in refused if is_told and reply.may_be_rules]
+            lines = [f"topic read {(parse_shared(name) or ('', name))[1]}" for name in lacking]
+            raise RefusedError(f"{text}: {why}" if why else text, by_rules=by_rules, lines=lines)
 
     def run(
         self, done: Callable[[], bool], deadline: float | None = None, step: float = 1.0

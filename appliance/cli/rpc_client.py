@@ -27,6 +27,7 @@ from appliance.cli.mqtt_client import (
     ConnectionSettings,
     MqttClient,
     RefusedError,
+    lines_needed,
 )
 
 NO_MATCHING_SUBSCRIBERS = 0x10
@@ -69,7 +70,7 @@ class RpcClient:
         """Call with a JSON payload; returns the answer as JSON. Waits up to `timeout` seconds."""
         above = topic.rpartition("/")[0]
         replies = f"{above}/_reply/{self._target.client_id}"
-        self._listen(f"{replies}/#", replies.replace(self._target.client_id, "%c"))
+        self._listen(f"{replies}/#", topic)
         token = secrets.token_hex(4)
         self._send(topic, token, payload, f"{replies}/{token}")
 
@@ -89,16 +90,20 @@ class RpcClient:
             raise CallFailedError(text)
         return encode(value)
 
-    def _listen(self, topic_filter: str, rule: str) -> None:
+    def _listen(self, topic_filter: str, topic: str) -> None:
         if topic_filter in self._listening:
             return
         try:
             self._connection.subscribe([topic_filter], 1, retained=False)
         except RefusedError as error:
-            advice = _as_ros_name(topic_filter)
-            line = f"The ACL line that allows it: pattern read {rule}/#"
-            raise error.advised(advice or line) from None
+            raise error.advised(_as_ros_name(topic) or self._rights(topic)) from None
         self._listening.add(topic_filter)
+
+    def _rights(self, topic: str) -> str:
+        """Both that a caller needs, as either may be the first that is refused."""
+        replies = f"{topic.rpartition('/')[0]}/_reply/%c"
+        lines = [f"topic write {topic}/#", f"pattern read {replies}/#"]
+        return lines_needed(self._target.username, lines)
 
     def _send(self, topic: str, token: str, payload: bytes, reply: str) -> None:
         properties = None
@@ -111,9 +116,7 @@ class RpcClient:
         try:
             code: ReasonCode = self._connection.publish(to, payload, 1, False, properties)
         except RefusedError as error:
-            advice = _as_ros_name(topic)
-            line = f"The ACL line that allows it: topic write {topic}/#"
-            raise error.advised(advice or line) from None
+            raise error.advised(_as_ros_name(topic) or self._rights(topic)) from None
         if code.value == NO_MATCHING_SUBSCRIBERS:
             raise ClientError(
                 f"nothing takes calls at {topic}: no route is for it, or it is not on the bus; "
@@ -169,8 +172,9 @@ class RpcClient:
             self._connection.subscribe(topics, 1, retained=False)
         except RefusedError as error:
             advice = _as_ros_name(f"{action}/_goal")
-            line = f"The ACL line that allows it: topic read {action}/#"
-            raise error.advised(advice or line) from None
+            calls = [f"topic write {action}/{call}/#" for call in ("_goal", "_cancel")]
+            lines = [f"topic read {action}/#", *calls]
+            raise error.advised(advice or lines_needed(self._target.username, lines)) from None
         id_ = orjson.loads(self.call(f"{action}/_goal", payload, ANSWER_TIMEOUT))["goal_id"]
         accepted(id_)
         deadline = None if timeout is None else time.monotonic() + timeout

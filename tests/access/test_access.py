@@ -719,8 +719,7 @@ def test_all_that_is_wrong_with_an_acl_is_told_at_once(tmp_path: Path) -> None:
         acl_of(tmp_path, text)
     assert [str(p).removeprefix(f"{tmp_path}/") for p in caught.value.problems] == [
         "acl.conf:1:1: unknown keyword 'topci'; did you mean 'topic'?",
-        "acl.conf:2:7: unknown access 'raed'; did you mean 'read'?; "
-        "a filter with a space in it needs the access before it",
+        "acl.conf:2:7: unknown access 'raed'; did you mean 'read'?",
         "acl.conf:3:6: a filter is missing after 'topic'",
         "acl.conf:4:12: 'a+/x': + must be a whole level",
         "acl.conf:5:3: a comment begins in the first column",
@@ -774,6 +773,16 @@ def test_explain(tmp_path: Path) -> None:
     assert {rule.line: why for rule, why in subscribe.passed_over}[5] == (
         "all that it gives there is denied by acl.conf:6: topic deny r2d2/secret/#"
     )
+    patterns = acl_of(tmp_path, "pattern read a/%c/#\n")
+    for topic, named in (
+        ("r2d2/odom", False),
+        ("a/tablet/x", True),
+        ("a/+/x", True),
+        ("b/#", False),
+    ):
+        for verdict in patterns.explain(Identity("alice", ""), topic).verdicts:
+            told = [why for _, why in verdict.passed_over if "gives" not in why]
+            assert verdict.action is Action.PUBLISH or ["cannot be put in" in told[0]] == [named]
     read, write, subscribe = acl.explain(NOBODY, "x").verdicts
     assert (read.rule, write.rule, subscribe.rule) == (None, None, None)
     with pytest.raises(ValueError, match="whole level"):

@@ -148,7 +148,7 @@ def test_a_publish_that_the_acl_refuses(peer: Peer, capfd: pytest.CaptureFixture
     assert run(peer.arguments("pub", "other", "-m", "x")) == 1
     error = capfd.readouterr().err
     assert "'other' was refused: Not authorized" in error
-    assert "appliance acl explain USER TOPIC" in error
+    assert "The ACL line that allows it: `topic write other`, below `user alice` or in" in error
 
 
 def test_a_port_alone_leaves_the_rest_to_the_configuration(
@@ -217,6 +217,7 @@ def test_a_server_that_speaks_no_tls(peer: Peer, capfd: pytest.CaptureFixture[st
 WORDS = {Property.REASON_STRING: "linear.x is\x1b no number"}
 ACCEPTED = Connack()
 ADVICE = "appliance acl explain"
+NO_RULE = "acl.conf: no rule lets user 'alice' subscribe to 'a'"
 
 
 @pytest.mark.parametrize(
@@ -247,6 +248,12 @@ ADVICE = "appliance acl explain"
             False,
         ),
         (
+            ["sub", "a", "$share/g/b"],
+            [ACCEPTED, Suback(1, [0x87, 0x87], {Property.REASON_STRING: f"'a': {NO_RULE}"})],
+            "The ACL lines that allow it: `topic read a` and `topic read b`, below `user alice`",
+            False,
+        ),
+        (
             ["sub", "a"],
             [Connack(False, 0x97, {Property.REASON_STRING: "user 'alice' has 3 sessions"})],
             "refused user 'alice': Quota exceeded: user 'alice' has 3 sessions\n",
@@ -260,7 +267,16 @@ ADVICE = "appliance acl explain"
             False,
         ),
     ],
-    ids=["puback", "pubrec", "puback-acl", "suback", "connack", "connack-silent", "disconnect"],
+    ids=[
+        "puback",
+        "pubrec",
+        "puback-acl",
+        "suback",
+        "suback-acl",
+        "connack",
+        "connack-silent",
+        "disconnect",
+    ],
 )
 def test_the_servers_reason_is_told(
     peer: Peer,

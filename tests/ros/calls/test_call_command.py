@@ -110,11 +110,13 @@ def test_a_call_that_fails_says_why(run):
 def test_rights_that_are_missing_are_named_as_the_rule_that_gives_them(run):
     code, _, errors = run("call", "/turtle/reset", user="bob")
     assert code == 1 and "pattern read r2d2/turtle/reset/_reply/%c/#" in errors
+    assert "`topic write r2d2/turtle/reset/_call/#` and" in errors and "below `user bob`" in errors
     assert run("call", "/turtle/pen", user="carol")[0] == 0
     code, _, errors = run("call", "/turtle/pen", user="bob")
     assert code == 1 and "topic write r2d2/turtle/pen/_call/#" in errors
     code, _, errors = run("goal", "/turtle/walk", user="carol")
     assert code == 1 and "topic read r2d2/turtle/walk/#" in errors
+    assert "topic write r2d2/turtle/walk/_goal/#" in errors
 
 
 def test_a_name_without_its_slash_is_no_missing_right(run):
