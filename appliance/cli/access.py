@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,6 +40,9 @@ def user_add(
             "logins that send it work as well.",
         ),
     ] = False,
+    group: Annotated[
+        list[str] | None, typer.Option(metavar="GROUP", help="A group of the user; repeatable.")
+    ] = None,
 ) -> None:
     """Add a user; asks for the password unless an option provides it."""
     settings = load(config)
@@ -48,8 +51,17 @@ def user_add(
             raise CommandError(
                 f"there is a user {name!r} already; `appliance user passwd` changes it"
             )
-        _set_password(users, name, password_file, generate, scram)
+        _set_password(
+            users,
+            name,
+            password_file,
+            generate,
+            scram,
+            # Before the user can log in, and only if there are such groups.
+            before_saving=lambda: _join(settings, name, group or []),
+        )
     typer.echo(f"user {name} added to {shown(users.path)}")
+    _say_without_rules(settings, name)
     _note(settings, "user added", name)
 
 
@@ -141,12 +153,42 @@ def _no_user(name: str, users: Passwords) -> str:
     return f"there is no user {name!r} in {shown(users.path)}"
 
 
+def _join(settings: Settings, name: str, wanted: list[str]) -> None:
+    from appliance.access import groups
+
+    if wanted:
+        groups.join(settings.broker.acl, settings.robot, name, wanted)
+
+
+def _say_without_rules(settings: Settings, name: str) -> None:
+    """Tell that a user may do nothing, where no rule is for it alone; patterns are for all."""
+    from appliance.access import AccessFileError, Acl, groups
+
+    path = settings.broker.acl
+    with suppress(AccessFileError, ValueError):  # there may be plugins instead
+        if any(rule.user == name for rule in Acl.load(path, settings.robot).rules):
+            return
+        known = ", ".join(groups.groups(path))
+        lines = f"`user {name}` and below it what it may do"
+        more = f", for example `include {groups.FOLDER}/NAME.conf` of a group: {known}"
+        typer.echo(
+            f"It may do nothing yet, as no rule is for it. Add to {shown(path)}: "
+            f"{lines}{more if known else ''}."
+        )
+
+
 def _set_password(
-    users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
+    users: Passwords,
+    name: str,
+    file: str | None,
+    generate: bool,
+    scram: bool | None,
+    before_saving: Callable[[], None] = lambda: None,
 ) -> None:
     password = new_password(name, file, generate)
     try:
         users.set(name, password, scram)
+        before_saving()
     except ValueError as error:
         raise CommandError(str(error)) from None
     users.save()

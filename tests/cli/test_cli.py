@@ -82,6 +82,21 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("sub") == 2
 
 
+def test_a_new_user_has_its_groups_or_is_told_that_it_may_do_nothing(
+    here: Path, output: pytest.CaptureFixture[str]
+) -> None:
+    assert run("user", "add", "bob", "--generate", "--group", "pilots") == 1
+    assert "no group 'pilots'; there are admins, drivers, viewers" in output.readouterr().err
+    assert "bob" not in Passwords.load(here / "users.passwd").users()
+    assert run("user", "add", "bob", "--generate") == 0
+    text = output.readouterr().out
+    assert "It may do nothing yet" in text and "a group: admins, drivers, viewers" in text
+    members = ["--group", "viewers", "--group", "drivers"]
+    assert run("user", "add", "carol", "--generate", *members) == 0
+    assert "nothing yet" not in output.readouterr().out
+    assert groups.members(here / "acl.conf")["carol"] == ["viewers", "drivers"]
+
+
 @pytest.mark.parametrize("content", [bytes(range(128, 256)), b"a" * 100_000])
 def test_a_password_file_that_is_something_else(
     here: Path, output: pytest.CaptureFixture[str], content: bytes
