@@ -1,7 +1,7 @@
 // Who may do what: users and their groups, why somebody may not, certificates.
 
 import { useState } from './vendor/hooks.mjs'
-import { shown } from './formats.js'
+import { counted, shown } from './formats.js'
 import { user as self, verb } from './link.js'
 import { Form, Groups, Lacking, Problem, Question, Table, Tabs, html, lack, ticked, useAnswer, useRights } from './manage.js'
 import { EnrolPhone } from './enrol-code.js'
@@ -45,7 +45,7 @@ function Users() {
         onClick=${() => choose(user === chosen ? null : user)}>Change</button>`,
     ],
   }))} />
-      <p class="quiet" role="status">${found.length} users${found.length > SHOWN ? `, the first ${SHOWN}` : ''}</p>
+      <p class="quiet" role="status">${counted(found.length, 'user')}${found.length > SHOWN ? `, the first ${SHOWN}` : ''}</p>
       ${one && html`<${User} key=${one.user} one=${one} groups=${answer.groups} rights=${rights}
         changed=${again} close=${() => choose(null)} />`}`}
     <details><summary>Add a user</summary><${Add} groups=${answer?.groups ?? null} rights=${rights} changed=${again} /></details>

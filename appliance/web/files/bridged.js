@@ -20,7 +20,7 @@ function Robot({ robot, routes }) {
   return html`<section><h2>Bridged topics of <bdi>${robot}</bdi></h2>
     <dl class="tiles">${ways.map(([way, label]) => html`<div><dt>${label}, a second</dt>
       <dd>${totalOf(routes.filter(({ direction }) => direction === way))}</dd></div>`)}</dl>
-    <div class="scroll" tabindex="0" role="region" aria-label="Bridged topics"><table>
+    <div class="scroll" tabindex="0" role="region" aria-label="Bridged topics"><table class="bridged">
     <thead><tr><th>ROS</th><th>MQTT</th><th class="number">Hz</th><th class="number">bytes</th></tr></thead>
     <tbody>${routes.slice(0, SHOWN).map((route) => html`<tr key=${route.key}>
       <td><a href=${`#/routes/${encodeURIComponent(route.key)}`}><bdi>${route.ros}</bdi></a></td>

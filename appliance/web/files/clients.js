@@ -2,7 +2,7 @@
 
 import { useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
-import { cut, shown, size } from './formats.js'
+import { counted, cut, shown, size } from './formats.js'
 import { verb } from './link.js'
 import { Lacking, Problem, Question, Table, duration, html, lack, useAnswer, useRights } from './manage.js'
 
@@ -48,8 +48,10 @@ function List() {
     <${Problem} words=${error} />
     ${answer === null ? !error && html`<p class="quiet">…</p>` : html`
       <${Table} label="Clients" heads=${HEADS} rows=${answer.clients.map(rowOf)} />
+      ${answer.clients.some(({ client }) => client.startsWith('console-')) && html`<p class="quiet">A window of this console
+        has up to five connections; their names are the same up to the last dash.</p>`}
       <p class="quiet" role="status">${answer.clients.length === 0 ? 'There is no such client.'
-    : `${answer.clients.length} clients${pages.length ? `, page ${pages.length + 1}` : ''}`}</p>
+    : `${counted(answer.clients.length, 'client')}${pages.length ? `, page ${pages.length + 1}` : ''}`}</p>
       <div class="tools">
         ${pages.length > 0 && html`<button onClick=${() => turn(pages.slice(0, -1))}>Previous</button>`}
         ${answer.next !== null && html`<button onClick=${() => turn([...pages, answer.next])}>Next</button>`}
@@ -85,7 +87,7 @@ function since(client) {
 }
 
 function queueOf({ queued, queued_bytes: bytes }) {
-  return queued ? `${queued} messages, ${size(bytes)}` : 'empty'
+  return queued ? `${counted(queued, 'message')}, ${size(bytes)}` : 'empty'
 }
 
 function One({ id, rights }) {
@@ -133,7 +135,7 @@ function factsOf(client) {
     ['certificate', client.certificate ? cut(client.certificate, LONGEST) : 'none'],
     ['MQTT', client.mqtt ?? '–'],
     ['queue', queueOf(client)],
-    ['in flight', `${client.inflight} messages`],
+    ['in flight', counted(client.inflight, 'message')],
     ['will', client.will ? 'yes' : 'no'],
     ['session ends', client.session_expiry === 0 ? 'with the connection' : `${duration(client.session_expiry)} after it`],
   ]

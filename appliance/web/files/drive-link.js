@@ -5,12 +5,14 @@ const PERIOD = 50 // ms; the appliance carries a stream of 10 Hz or more
 const PAGE_PATIENCE = 300 // ms without a word of the page: its thread hangs
 const UNANSWERED = 4 // commands on their way; more wait for no one
 const GOODBYE = 1000 // ms for the acknowledgement of the stop message
+const BEGINS = 'a stream is carried out from its third command on' // the bridge's word for what is usual
 
 export class Drive {
   constructor(open) {
     this.open = open
     this.route = null
     this.client = null
+    this.driver = '' // the client id of the connection that drove last
     this.timer = null
     this.state = 'idle'
     this.reason = ''
@@ -71,6 +73,7 @@ export class Drive {
     }
     if (!this.client?.connected || this.unanswered >= UNANSWERED) return
     this.state = 'driving'
+    this.driver = this.client.options.clientId
     this.publish(...this.wanted)
   }
 
@@ -86,12 +89,12 @@ export class Drive {
       { qos: 1, properties: { contentType: 'application/json' } },
       (error, packet) => {
         if (client === this.client) this.unanswered -= 1
-        // The first two commands of a stream are refused as possibly old; then that is over.
         if (!error && this.timer !== null) this.reason = ''
         const code = packet?.reasonCode ?? error?.code ?? 0
-        if (error && code >= 0x80) {
+        const words = packet?.properties?.reasonString
+        // The first two of each connection may be old, for all that the bridge knows.
+        if (error && code >= 0x80 && !words?.includes(BEGINS)) {
           this.refused += 1
-          const words = packet?.properties?.reasonString
           if (words) this.reason = words
           else if (code === 0x87) {
             this.reason = 'Not authorized: another client commands, or no access rule lets this user '
@@ -139,7 +142,7 @@ export class Drive {
   }
 
   told() {
-    const { state, reason, sent, refused } = this
-    return { state, reason, sent, refused }
+    const { state, reason, sent, refused, driver } = this
+    return { state, reason, sent, refused, driver }
   }
 }

@@ -118,7 +118,8 @@ function Control({ route }) {
   const [linear, angular] = speed
   return html`
     ${words && html`<p class="notice bad" role="alert">${words}</p>`}
-    <p class="quiet">${route.commanding ? html`Commanding now: <strong><bdi>${route.commanding}</bdi></strong>` : ''}
+    <p class="quiet">${route.commanding ? html`Commanding now: <strong><bdi>${
+    route.commanding === told?.driver ? 'you' : route.commanding}</bdi></strong>` : ''}
       ${!route.isClamped && ' The route has no clamp, so the speeds are cautious ones.'}</p>
     <label class="share">Speed: ${Math.round(share * 100)} % of the limits
       <input type="range" min="0.1" max="1" step="0.1" value=${share} disabled=${Boolean(route.obstacle)}
@@ -226,7 +227,7 @@ class Hold {
     }
     const x = part(event.clientX, box.left, box.width)
     const y = part(event.clientY, box.top, box.height)
-    this.take('touch', -y || 0, -x || 0)
+    this.take(event.pointerType || 'touch', -y || 0, -x || 0)
   }
 
   keyDown(event) {

@@ -278,6 +278,11 @@ export function shown(name, length = 120) {
   return cut(name, length).replace(/[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]/g, '·')
 }
 
+/** A number of things: `one` is the word for one of them. */
+export function counted(number, one) {
+  return `${number} ${one}${number === 1 ? '' : 's'}`
+}
+
 export function size(bytes) {
   if (bytes < 1024) return `${bytes} B`
   return bytes < 1048576 ? `${(bytes / 1024).toFixed(1)} KiB` : `${(bytes / 1048576).toFixed(1)} MiB`

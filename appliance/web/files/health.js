@@ -1,7 +1,7 @@
 // How the appliance is: what the doctor finds, the last lines of the log, the end of the audit log.
 
 import { useState } from './vendor/hooks.mjs'
-import { cut, shown } from './formats.js'
+import { counted, cut, shown } from './formats.js'
 import { verb } from './link.js'
 import { Form, Lacking, Problem, Table, Tabs, html, lack, useAnswer, useRights } from './manage.js'
 
@@ -26,14 +26,16 @@ const EXAMINATION = 120000 // ms
 function Doctor({ rights }) {
   const [found, setFound] = useState(null)
   const act = async () => {
+    setFound(null)
     const { findings } = await verb('doctor', {}, EXAMINATION)
     setFound(findings.filter((each) => each && typeof each === 'object')
       .sort((one, other) => RANKS[one.level] - RANKS[other.level]))
   }
   const bad = found?.filter(({ level }) => level !== 'ok').length
-  return html`<p>All that the appliance needs of its computer and of ROS is examined; that takes seconds, and changes nothing.</p>
-    <${Form} word="Examine" lacking=${lack(rights, 'doctor')} act=${act} />
-    ${found && html`<p role="status">${found.length} findings, ${bad ? `${bad} to look at` : 'all is well'}.</p>
+  return html`<p>All that the appliance needs of its computer and of ROS is examined; that takes
+    seconds, on a busy computer up to two minutes, and changes nothing.</p>
+    <${Form} word="Examine" busy="Examining …" lacking=${lack(rights, 'doctor')} act=${act} />
+    ${found && html`<p role="status">${counted(found.length, 'finding')}, ${bad ? `${bad} to look at` : 'all is well'}.</p>
       <ul class="findings">${found.map(({ level, subject, text, advice }, index) => html`
         <li key=${index} class=${level}><strong>${level === 'ok' ? '✓' : `${level}:`} <bdi>${shown(subject)}</bdi></strong>
           <div><bdi>${shown(text, 2000)}</bdi></div>
@@ -67,11 +69,19 @@ function levelOf(line) {
   return (found[1] ?? found[2]).toLowerCase() === 'warning' ? 'warning' : 'error'
 }
 
+const NONE = 'rejected: ' // what the verb answers where there is no audit log
+
+function NoAudit() {
+  return html`<div class="notice"><p>There is no audit log: it is off unless <code>appliance.yaml</code> names a file. Add
+    this to its section <code>broker</code>, and restart the appliance:</p>
+    <pre>${'broker:\n  audit: {path: audit.log}'}</pre></div>`
+}
+
 function Audit() {
   const { answer, error, again } = useAnswer('audit', { lines: ENTRIES })
   const entries = (answer?.entries ?? []).filter((each) => each && typeof each === 'object').reverse()
   return html`<div class="tools"><button onClick=${again}>Refresh</button></div>
-    <${Problem} words=${error} />
+    ${error.startsWith(NONE) ? html`<${NoAudit} />` : html`<${Problem} words=${error} />`}
     ${answer && html`<p class="quiet">The last ${entries.length} entries, the newest first</p>
       <${Table} label="Audit log" heads=${[['Time', 'wide time'], ['Event', 'main'], ['Details', 'wide']]}
         rows=${entries.map(({ time, event, what, ...more }, index) => ({

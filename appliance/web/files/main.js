@@ -140,7 +140,8 @@ function SignIn() {
     ${parts && html`<section><h2>This robot</h2><dl class="facts">${parts.map(([part, state]) => html`
       <div><dt>${part}</dt><dd class=${state === 'not ready' ? 'bad' : ''}>${state}</dd></div>`)}</dl></section>`}
     ${fingerprint && html`<section class="facts"><h2>Fingerprint of its CA</h2>
-      <p class="quiet">SHA-256; compare it with what this prints on the robot:<br />
+      <p class="quiet">SHA-256; compare it with what this prints on the robot, in the folder
+        of its appliance.yaml:<br />
         <code>openssl x509 -in certs/ca.crt -noout -fingerprint -sha256</code></p>
       <code class="fingerprint">${fingerprint}</code></section>`}
   </main>`

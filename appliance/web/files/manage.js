@@ -80,9 +80,9 @@ export function Table({ label, heads, rows }) {
 
 /**
  * A form for a change: `act` gets the fields and returns what to say, and `lacking` is the line of the
- * ACL that is missing. Fields are emptied when it is done.
+ * ACL that is missing; `busy` is what to say while it takes its time. Fields are emptied when it is done.
  */
-export function Form({ word, lacking, act, children }) {
+export function Form({ word, busy, lacking, act, children }) {
   const [told, setTold] = useState({ words: '', isBad: false, isBusy: false })
   const submit = async (event) => {
     event.preventDefault()
@@ -99,8 +99,20 @@ export function Form({ word, lacking, act, children }) {
   return html`<form class="change" onSubmit=${submit}>
     <fieldset disabled=${Boolean(lacking) || told.isBusy}>${children}<button>${word}</button></fieldset>
     ${lacking && lacking !== '…' && html`<p class="quiet">Needs <code>${lacking}</code></p>`}
+    ${busy && told.isBusy && html`<${Working} words=${busy} />`}
     ${told.words && html`<p class=${told.isBad ? 'notice bad' : 'good'} role=${told.isBad ? 'alert' : 'status'}>
       ${told.words}</p>`}</form>`
+}
+
+/** That something goes on, and for how long: the words are read aloud once, the seconds are only seen. */
+function Working({ words }) {
+  const [seconds, setSeconds] = useState(0)
+  useEffect(() => {
+    const begun = performance.now()
+    const timer = setInterval(() => setSeconds(Math.floor((performance.now() - begun) / 1000)), 200)
+    return () => clearInterval(timer)
+  }, [])
+  return html`<p class="notice"><span role="status">${words}</span> ${seconds} s</p>`
 }
 
 /** Boxes for the groups of a user; `all` are null while they are not known. */

@@ -6,7 +6,7 @@ import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
 import { robots } from './link.js'
 import { Refused, useShelf } from './calling.js'
-import { size } from './formats.js'
+import { counted, size } from './formats.js'
 import { valueOf } from './json-text.js'
 
 const html = htm.bind(h)
@@ -97,7 +97,7 @@ function List({ all }) {
       <select class="narrow" aria-label="Sort by" value=${by} onChange=${(event) => sort(event.currentTarget.value)}>
         ${COLUMNS.map(([name, label]) => html`<option key=${name} value=${name}>by ${label}</option>`)}</select>
     </div>
-    <p class="quiet" role="status">${found.length} routes${found.length > SHOWN ? `, the first ${SHOWN} are shown` : ''}</p>
+    <p class="quiet" role="status">${counted(found.length, 'route')}${found.length > SHOWN ? `, the first ${SHOWN} are shown` : ''}</p>
     <table class="routes"><thead><tr>${COLUMNS.map(([name, label]) => html`
       <th key=${name} class=${NUMBERS.has(name) ? 'number' : ''} aria-sort=${by === name ? (isDown ? 'descending' : 'ascending') : null}>
         <button class="quiet" onClick=${() => sort(name)}>${label}${by === name ? (isDown ? ' ▼' : ' ▲') : ''}</button></th>`)}

@@ -4,7 +4,7 @@ import { h } from './vendor/preact.mjs'
 import { useEffect, useMemo, useRef, useState } from './vendor/hooks.mjs'
 import { computed, signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { shown } from './formats.js'
+import { counted, shown } from './formats.js'
 import { ask, focus, inspected, isPaused, names, pause, robot, robots, rows, tell, untold } from './link.js'
 import { save } from './save.js'
 
@@ -43,7 +43,7 @@ function Tree({ topic }) {
       <button aria-pressed=${isPaused.value} onClick=${() => pause(!isPaused.value)}>
         ${isPaused.value ? 'Continue' : 'Pause'}</button>
     </div>
-    <p class="quiet" role="status">${found.length} topics${untold.value > 0
+    <p class="quiet" role="status">${counted(found.length, 'topic')}${untold.value > 0
   ? `; more than can be kept, ${untold.value} messages of others were left out` : ''}</p>
     <ul class="tree">${root === null
     ? found.slice(0, SHOWN).map((name) => html`<${Row} key=${name} name=${name} label=${name} topic=${topic} />`)
@@ -136,7 +136,7 @@ function Inspector({ topic }) {
       <div class="tools">
         <button aria-pressed=${isPaused.value} onClick=${() => pause(!isPaused.value)}>
           ${isPaused.value ? 'Continue' : 'Pause'}</button>
-        <button onClick=${keep}>Export ${told.kept} messages</button>
+        <button onClick=${keep}>Export ${counted(told.kept, 'message')}</button>
         ${message.kind === 'image' && html`<a class="button" href=${`#/camera/${encodeURIComponent(topic)}`}>Camera</a>`}
       </div>
       <dl class="properties">
@@ -168,7 +168,7 @@ function Leaves({ leaves, path }) {
 }
 
 function History({ told, message }) {
-  return html`<details><summary>History: ${told.kept} messages</summary>
+  return html`<details><summary>History: ${counted(told.kept, 'message')}</summary>
     <ul class="tree">${[...told.history].reverse().map(([number, at, size, text]) => html`
       <li key=${number}><button class="row" aria-current=${number === message.number ? 'true' : null}
         onClick=${() => tell('show', { index: number })}>

@@ -13,6 +13,9 @@ const SURVEY_PACKET = 32 * 1024
 const FOCUS_PACKET = 12 * 1024 * 1024
 const MAX_RATE = '2' // messages a second of each topic in the survey
 const TOKEN = 'appliance-token-' // what each begins with
+// What the client ids of this window begin with: who sees a list of clients sees which belong together.
+// How they end cannot be guessed either: somebody else might have taken the next one.
+const WINDOW = `console-${random()}`
 const LEAVING = 3000 // ms for the token's end; then the page goes
 const WRONG = [0x86, 0x87] // reason codes of a login that is not accepted
 const LATER = [0x88, 0x89, 0x97, 0x9f] // and of one that may be, with the same password, after a while
@@ -29,10 +32,14 @@ let state = { name: 'out', reason: '' }
 let newest = new Newest()
 let about = null // what robots say of their bridges
 
+function random() {
+  return crypto.getRandomValues(new Uint32Array(1))[0].toString(36)
+}
+
 function options(more, packet) {
   return {
     protocolVersion: 5,
-    clientId: `console-${crypto.getRandomValues(new Uint32Array(2)).join('-')}`,
+    clientId: `${WINDOW}-${random()}`,
     username: login.user,
     // At each connect, as a client that reconnects keeps what it was made with.
     transformWsUrl: (url, _, client) => {

@@ -1,0 +1,78 @@
+"""What somebody sees who opens the console for the first time: it fits, and it is said in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from appliance_process import ROBOT, ApplianceProcess
+from visits import DESKTOP, PHONE, Visit
+
+pytest.importorskip("rclpy")
+pytest.importorskip("playwright.sync_api")
+
+
+def assert_fits(page: Any) -> None:
+    """Nothing is beyond the right edge of the screen."""
+    width, screen = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert width <= screen
+
+
+@pytest.mark.parametrize("screen", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_a_long_value_in_an_unfolded_tree(visit: Callable[..., Visit], screen: Any) -> None:
+    visited = visit(**screen)
+    page = visited.sign_in(page="Topics")
+    page.wait_for_selector("button.fold")
+    row = f"a.row[href$='{ROBOT}%2Fodom']"
+    if page.query_selector(row) is None:
+        page.click(f"button.fold:has-text('{ROBOT}')")
+    page.wait_for_selector(f"{row} .value:has-text('frame_id')")
+    assert_fits(page)
+    visited.look(f"{screen['viewport']['width']}-topics-unfolded")
+    page.click(row)
+    page.wait_for_selector(".leaves")
+    assert_fits(page)
+    visited.look(f"{screen['viewport']['width']}-topics-inspected")
+
+
+def test_what_has_a_ring(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:
+    """The page's content gets the focus after Enter, without a ring; what a key reaches has one."""
+    page = visit(**DESKTOP).page
+    page.fill("input[name=user]", "alice")
+    page.fill("input[name=password]", appliance.passwords["alice"])
+    page.press("input[name=password]", "Enter")
+    page.wait_for_selector("main:focus")
+    style = "getComputedStyle(document.activeElement).outlineStyle"
+    assert page.evaluate(style) == "none"
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.localName") != "main"
+    assert page.evaluate(style) == "solid"
+
+
+def test_who_drives_with_what(visit: Callable[..., Visit]) -> None:
+    """It is oneself, with a mouse, and nothing was refused: what each stream begins with is not."""
+    visited = visit(**DESKTOP)
+    page = visited.sign_in(page="Drive")
+    page.wait_for_selector("dd:text-is('ready')")
+    page.hover(".pad", position={"x": 200, "y": 20})
+    page.mouse.down()
+    page.wait_for_selector("strong bdi:text-is('you')")
+    assert page.inner_text(".hint") == "Driving by mouse"
+    visited.look("desktop-driving-by-mouse")
+    page.mouse.up()
+    page.keyboard.down("ArrowUp")
+    page.wait_for_selector(".hint:text-is('Driving by keys')")
+    page.wait_for_selector("strong bdi:text-is('you')")
+    page.keyboard.up("ArrowUp")
+    assert page.inner_text("dt:text-is('Refused') + dd") == "0"
+
+
+def test_no_audit_log(visit: Callable[..., Visit]) -> None:
+    """It is off unless it is wanted, which is no error; the page says how to turn it on."""
+    visited = visit(**PHONE)
+    page = visited.sign_in(page="Health")
+    page.click("nav a:has-text('Audit')")
+    page.wait_for_selector(".notice pre:has-text('audit: {path: audit.log}')")
+    assert page.query_selector(".notice.bad") is None
+    visited.look("phone-no-audit")
