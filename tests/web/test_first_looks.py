@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -76,3 +77,19 @@ def test_no_audit_log(visit: Callable[..., Visit]) -> None:
     page.wait_for_selector(".notice pre:has-text('audit: {path: audit.log}')")
     assert page.query_selector(".notice.bad") is None
     visited.look("phone-no-audit")
+
+
+def test_figures_in_words(visit: Callable[..., Visit]) -> None:
+    """Whole messages, a time in its units, and why a client that has just come is not there."""
+    visited = visit(**PHONE)
+    page = visited.sign_in()
+    page.wait_for_selector("text='Up'")
+    assert re.fullmatch(r"(\d+ min)? ?(\d+ s)?", page.inner_text("dt:text-is('Up') + dd"))
+    assert page.inner_text("dt:text-is('Messages out, a minute') + dd").isdigit()
+    page.wait_for_selector("text=/who has just come is not counted yet/")
+    visited.look("phone-figures")
+    page.click("nav a:has-text('Clients')")
+    page.wait_for_selector("text=/up to five connections/")
+    names = [name.rpartition("-")[0] for name in page.locator("td.main").all_inner_texts()]
+    assert len(names) > 1 and len(set(names)) == 1
+    visited.look("phone-clients-of-a-window")

@@ -4,7 +4,7 @@ import { h, render } from './vendor/preact.mjs'
 import { useEffect, useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { names, resume, robot, robots, rows, session, signIn, signOut, user } from './link.js'
+import { resume, robot, robots, session, signIn, signOut, user } from './link.js'
 import { isTopic } from './topic-name.js'
 
 const html = htm.bind(h)
@@ -24,6 +24,7 @@ const PAGES = [
 ]
 const LOADERS = {
   bridged: () => import('./bridged.js'), // of the overview
+  figures: () => import('./figures.js'), // also
   topics: () => import('./topics.js'),
   publish: () => import('./publish.js'),
   routes: () => import('./routes.js'),
@@ -181,18 +182,6 @@ async function readiness() {
 
 // --- overview --------------------------------------------------------------------------------
 
-const FIGURES = [
-  ['clients/connected', 'Clients'],
-  ['subscriptions/count', 'Subscriptions'],
-  ['retained messages/count', 'Retained messages'],
-  ['load/messages/received/1min', 'Messages in, a minute'],
-  ['load/messages/sent/1min', 'Messages out, a minute'],
-  ['publish/messages/dropped', 'Dropped'],
-  ['errors', 'Faults'],
-  ['uptime', 'Up'],
-  ['version', 'Version'],
-]
-
 function Overview() {
   const [parts, setParts] = useState([])
   useEffect(() => {
@@ -205,7 +194,6 @@ function Overview() {
   for (const [part, state] of parts) {
     if (state === 'not ready') warnings.unshift([`${part} is not ready`, ''])
   }
-  names.value // a $SYS topic that comes for the first time
   return html`<h1>Overview</h1>
     <section aria-labelledby="warnings"><h2 id="warnings">Warnings</h2>
       ${warnings.length === 0 ? html`<p class="good">None.</p>` : html`<ul class="warnings">${warnings
@@ -214,15 +202,8 @@ function Overview() {
     <section aria-labelledby="state"><h2 id="state">State</h2><dl class="tiles">
       ${parts.map(([part, state]) => html`<div><dt>${part}</dt>
         <dd class=${state === 'not ready' ? 'bad' : ''}>${state}</dd></div>`)}
-      ${FIGURES.map(([name, label]) => html`<${Figure} key=${name} name=${name} label=${label} />`)}
-    </dl></section>
+    </dl><${Later} page="figures" /></section>
     <${Later} page="bridged" />`
-}
-
-function Figure({ name, label }) {
-  const found = rows.get(`$SYS/broker/${name}`)
-  if (!found) return null
-  return html`<div><dt>${label}</dt><dd>${found.value.text}</dd></div>`
 }
 
 function warningsOf(robot, { routes = [], skipped }) {

@@ -157,5 +157,6 @@ export function duration(seconds) {
   const [days, hours, minutes] = [seconds / 86400, (seconds / 3600) % 24, (seconds / 60) % 60].map(Math.floor)
   if (days) return `${days} d${hours ? ` ${hours} h` : ''}`
   if (hours) return `${hours} h${minutes ? ` ${minutes} min` : ''}`
-  return minutes ? `${minutes} min` : `${Math.floor(seconds)} s`
+  const rest = Math.floor(seconds % 60)
+  return minutes ? `${minutes} min${rest ? ` ${rest} s` : ''}` : `${rest} s`
 }
