@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
-
-log = logging.getLogger(__name__)
 
 #: Lines that are logged for one key in one interval, and the length of an interval in seconds.
 BURST = 5
@@ -22,6 +21,7 @@ class _Entry:
     """What was logged and suppressed for one key since the interval began."""
 
     since: float
+    log: logging.Logger
     logged: int = 0
     suppressed: int = 0
     last: str = ""
@@ -30,7 +30,8 @@ class _Entry:
 class RateLimitedLog:
     """Logs warnings, at most BURST for a key in an interval.
 
-    Suppressed warnings are counted; the count and the last text are logged when the interval ends.
+    The lines have the name of the caller's module, as if it had logged itself. Suppressed warnings
+    are counted; the count and the last text are logged when the interval ends.
     """
 
     def __init__(self) -> None:
@@ -44,13 +45,14 @@ class RateLimitedLog:
         if entry is None or now - entry.since >= INTERVAL:
             if entry is not None:
                 self._log_suppressed(entry)
-            entry = self._entries[key] = _Entry(now)
+            log = logging.getLogger(sys._getframe(1).f_globals["__name__"])
+            entry = self._entries[key] = _Entry(now, log)
             if len(self._entries) > MAXIMUM_KEYS:
                 self._log_suppressed(self._entries.popitem(last=False)[1])
         self._entries.move_to_end(key)
         if entry.logged < burst:
             entry.logged += 1
-            log.warning(message, *args)
+            entry.log.warning(message, *args)
         else:
             entry.suppressed += 1
             entry.last = message % args
@@ -64,4 +66,4 @@ class RateLimitedLog:
 
     def _log_suppressed(self, entry: _Entry) -> None:
         if entry.suppressed:
-            log.warning("%d more of this kind, the last: %s", entry.suppressed, entry.last)
+            entry.log.warning("%d more of this kind, the last: %s", entry.suppressed, entry.last)

@@ -47,8 +47,11 @@ def list_clients(
     found = list(_clients(options, {"user": of, "connected": None if show_all else True}))
     if as_json:
         typer.echo("".join(f"{json.dumps(each)}\n" for each in found), nl=False)
-    else:
+    elif found:
         print_table([HEAD, *map(_row, found)])
+    else:
+        whose = "" if of is None else f" as user {of}"
+        typer.echo(f"there is no session{whose}" if show_all else f"nobody is connected{whose}")
 
 
 @clients_app.command("disconnect", hidden=True)  # as the verb is called

@@ -109,9 +109,14 @@ def uninstall(
             raise CommandError("no terminal to ask on; --yes says that it is meant")
         typer.confirm(f"{question}? Nothing brings them back.", abort=True)
     try:
+        steps = installation.uninstall(purge=purge)
+        first = next(steps, None)
+        if first is None:
+            typer.echo("no service is installed, and nothing of one is left")
+            return
         if dry_run:
             typer.echo("Nothing is done. Without --dry-run this would be:")
-        for step in installation.uninstall(purge=purge):
+        for step in (first, *steps):
             _say(step)
     except InstallError as error:
         raise CommandError(str(error)) from None

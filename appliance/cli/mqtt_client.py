@@ -26,6 +26,9 @@ ANSWER_TIMEOUT = 10.0  # seconds to wait for an acknowledgement
 #: In the reason of the appliance's broker, where no line denies but one is missing.
 _NO_RULE: Final = ": no rule lets "
 
+#: Python's text for an alert of the other end, such as SSLV3_ALERT_CERTIFICATE_REVOKED.
+_ALERT: Final = re.compile(r"\[SSL: \w*ALERT_(\w+)\]")
+
 
 class ClientError(Exception):
     """The broker is unreachable or refused a request; the message says what and why."""
@@ -190,6 +193,7 @@ class MqttClient:
         self._granted: dict[int | None, list[BrokerReply]] = {}
         self._published: dict[int, BrokerReply] = {}
         self._ended: BrokerReply | None = None
+        self._alert = ""
         self._client = client = paho.Client(
             CallbackAPIVersion.VERSION2, target.client_id, protocol=target.version
         )
@@ -207,6 +211,7 @@ class MqttClient:
             {mid: BrokerReply(code, p)}
         )
         client.on_message = lambda c, u, message: on_message(message)
+        client.on_log = self._note_alert
         context = _tls(target)
         if target.certificate is not None:
             _load_certificate(context, target.certificate, target.key)
@@ -313,8 +318,16 @@ class MqttClient:
             if self._ended is not None or code != MQTTErrorCode.MQTT_ERR_SUCCESS:
                 known = self._ended is not None and self._ended.code.value >= 0x80
                 why = str(self._ended) if known else "without giving a reason"
+                if self._alert:
+                    why = f"TLS says: {self._alert}"
                 raise ClientError(f"{self._target.address} ended the connection: {why}")
         return True
+
+    def _note_alert(self, client: paho.Client, data: object, level: int, text: str) -> None:
+        """Under TLS 1.3 a client's certificate is refused behind the handshake, at the first read:
+        paho tells that error to its log alone."""
+        if found := _ALERT.search(text):
+            self._alert = found[1].lower().replace("_", " ")
 
     def _wait(self, done: Callable[[], bool], what: str) -> None:
         if not self.run(done, time.monotonic() + ANSWER_TIMEOUT):

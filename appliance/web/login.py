@@ -60,7 +60,10 @@ class WebLogin:
             return who
         self.note(request, username, who)
         if who.code in WRONG_LOGIN:
-            return text(401, "a user name and its password are needed")
+            if username is None and password is None:
+                return text(401, "a user name and its password are needed")
+            # The same for a user who is not known: nobody finds out who is.
+            return text(401, "the user name or the password is wrong, or the token has ended")
         return text(503, "the login cannot be checked now", ("Retry-After", str(RETRY_AFTER)))
 
     async def may_read(self, request: HttpRequest, topic: str) -> HttpResponse | None:

@@ -11,7 +11,7 @@ from appliance.broker.broker import ENDINGS_PER_TICK, Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Features, Limits
 from appliance.broker.message import Message
-from appliance.broker.rate_limited_log import BURST, INTERVAL
+from appliance.broker.rate_limited_log import BURST, INTERVAL, RateLimitedLog
 from appliance.broker.session import REPLAYED_PER_TURN, subscription_size
 from appliance.broker.values import Action
 from appliance.mqtt.codec import Properties, Property
@@ -80,6 +80,15 @@ def test_what_pubrec_took_is_kept_though_the_queue_filled_meanwhile(join: Join):
     assert fill(join("publisher"), 5)[-1] == 0x97
     promised.send(bytes.fromhex("62 02 0001"))
     assert b"promised" in [m.payload for m in subscriber.drain()]
+
+
+def test_a_line_has_the_name_of_who_logs(caplog: pytest.LogCaptureFixture):
+    limited = RateLimitedLog()
+    for number in range(BURST + 1):
+        limited.warning(0.0, "key", "number %d", number)
+    limited.tick(INTERVAL)
+    assert {record.name for record in caplog.records} == {__name__}
+    assert caplog.messages[-1] == f"1 more of this kind, the last: number {BURST}"
 
 
 @pytest.mark.parametrize("limits", [Limits(queue_full="drop-oldest", **SMALL)])

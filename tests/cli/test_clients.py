@@ -48,6 +48,8 @@ async def test_here_and_from_afar(
         # Options of the list do not reach a command behind them: it would be done here.
         code, text = await told("clients", *afar, "kick", "tablet")
         assert code == 2 and "behind" in text
+        code, text = await told("clients", "--of", "mallory", "--config", config)
+        assert (code, text) == (0, "nobody is connected as user mallory\n")
         code, text = await told("clients", "delete", "nobody", "--config", config)
         assert code == 1 and text == "appliance: there is no client 'nobody'\n"
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import socket
 import ssl
@@ -311,6 +312,34 @@ def test_the_servers_reason_is_told(
     error = capfd.readouterr().err
     assert told in error
     assert (ADVICE in error) is is_advised
+
+
+def test_the_alert_of_a_client_certificate_that_is_refused(
+    peer: Peer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(peer.directory / "server.crt", peer.directory / "server.key")
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.verify_mode = ssl.CERT_REQUIRED  # and the client has none
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(PATIENCE)
+
+        def refuse() -> None:
+            client, _ = server.accept()
+            client.settimeout(PATIENCE)
+            # Open until the client has read: a reset would overtake the alert.
+            with client.dup() as kept:
+                with contextlib.suppress(ssl.SSLError):
+                    context.wrap_socket(client, server_side=True)
+                while kept.recv(65536):
+                    pass
+
+        thread = Thread(target=refuse)
+        thread.start()
+        assert run(peer.arguments("sub", "a", "-p", str(server.getsockname()[1]))) == 1
+        thread.join(PATIENCE)
+    assert "ended the connection: TLS says: " in (error := capfd.readouterr().err)
+    assert "certificate required" in error
 
 
 def test_a_certificate_without_its_key(

@@ -39,7 +39,7 @@ _IN_MEMORY = ("tmpfs", "ramfs")
 def clock(settings: Settings, running: dict[str, Any] | None) -> Iterator[Finding]:
     """Whether the clock is set, and whether something keeps it right."""
     now = datetime.now(timezone.utc)
-    advice = "timedatectl set-ntp true, or set it by hand: date -s '2026-05-04 12:00'"
+    advice = "timedatectl set-ntp true, or set it by hand: date -s 'YYYY-MM-DD HH:MM'"
     if is_unset(now):
         text = (
             f"it says {now:%Y-%m-%d}, which is before this program was made "

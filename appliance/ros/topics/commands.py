@@ -728,7 +728,8 @@ class Commands(ToRos):
             return
         if not self._has_stopped:
             # It stops what was before the route, and overtakes nothing that has come since.
-            self._publish_stop("there is somebody to hear it")
+            level = logging.WARNING if self._is_driven else logging.INFO
+            self._publish_stop("there is somebody to hear it", level)
         awaited, self._awaited = self._awaited, None
         if awaited is None:
             return
@@ -745,7 +746,7 @@ class Commands(ToRos):
         self._lease.stop(self._staleness.number + 1)
         self._publish_stop(why)
 
-    def _publish_stop(self, why: str) -> None:
+    def _publish_stop(self, why: str, level: int = logging.WARNING) -> None:
         """Publish the stop message now, or as soon as ROS takes it."""
         publication = self.follower.publication
         outlet, stop = publication.outlet, publication.stop
@@ -770,7 +771,9 @@ class Commands(ToRos):
         self._is_driven = self._must_stop = False
         self._has_stopped = publication.is_found
         self.counters.stops += 1
-        self._log_limited("stopped", "%s: the stop message was published: %s", why)
+        # Each level by itself: what is no news keeps no warning from the log.
+        what = f"stopped at level {level}"
+        self._log_limited(what, "%s: the stop message was published: %s", why, level=level)
 
     def _cannot_stop(self, error: Exception) -> None:
         self.fail(f"that stops could not be published: {error}")
