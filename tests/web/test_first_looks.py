@@ -33,6 +33,8 @@ def test_a_long_value_in_an_unfolded_tree(visit: Callable[..., Visit], screen: A
     visited.look(f"{screen['viewport']['width']}-topics-unfolded")
     page.click(row)
     page.wait_for_selector(".leaves")
+    time = page.inner_text("dt:text-is('received') + dd")
+    assert re.fullmatch(r"\d+:\d\d:\d\d\.\d{3}(\s[AP]M)?", time)
     assert_fits(page)
     visited.look(f"{screen['viewport']['width']}-topics-inspected")
 

@@ -178,8 +178,8 @@ function History({ told, message }) {
 }
 
 function clock(at) {
-  const time = new Date(at)
-  return `${time.toLocaleTimeString()}.${String(time.getMilliseconds()).padStart(3, '0')}`
+  const parts = { hour: 'numeric', minute: '2-digit', second: '2-digit', fractionalSecondDigits: 3 }
+  return new Date(at).toLocaleTimeString(undefined, parts)
 }
 
 function Picture({ bitmap }) {
