@@ -26,6 +26,15 @@ def _explained(error: RefusedError, user: str | None) -> CommandError:
     return CommandError(str(error.advised(advice)))
 
 
+def _say_silent() -> None:
+    typer.secho(
+        "nothing came yet; on the robot, `appliance routes` shows what is bridged, and to which "
+        "topics; `appliance sub -v '#'` prints all that this user may read",
+        fg="yellow",
+        err=True,
+    )
+
+
 @connecting
 def pub(
     connection: ConnectionOptions,
@@ -116,6 +125,7 @@ def sub(
             rate=rate,
             count=count,
             timeout=timeout,
+            on_silence=_say_silent if sys.stderr.isatty() else None,
         )
     except client.RefusedError as error:
         raise _explained(error, connection.user) from None

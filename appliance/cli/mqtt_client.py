@@ -23,6 +23,9 @@ from appliance.ops.logs import VISIBLE, VISIBLE_IN_LINES
 
 ANSWER_TIMEOUT = 10.0  # seconds to wait for an acknowledgement
 
+#: Seconds without a message after which who subscribes may wonder.
+SILENCE = 5.0
+
 #: In the reason of the appliance's broker, where no line denies but one is missing.
 _NO_RULE: Final = ": no rule lets "
 
@@ -140,10 +143,12 @@ def subscribe(
     rate: bool = False,
     count: int | None = None,
     timeout: float | None = None,
+    on_silence: Callable[[], None] | None = None,
 ) -> int:
     """Write received messages to `output`, one per line; returns their number.
 
     A line begins with the topic if `verbose`, and before that with `Arrivals.note` if `rate`.
+    `on_silence` is called once if nothing comes in the first seconds.
     Ends after `count` messages or `timeout` seconds, whichever is first; without either it runs
     until interrupted. Raises ClientError, also when the broker ends the connection.
     """
@@ -166,6 +171,11 @@ def subscribe(
     try:
         connection.subscribe(filters, qos)
         deadline = None if timeout is None else time.monotonic() + timeout
+        if on_silence is not None:
+            until = time.monotonic() + SILENCE
+            is_early = deadline is None or until < deadline
+            if is_early and not connection.run(lambda: received > 0, until):
+                on_silence()
         connection.run(lambda: count is not None and received >= count, deadline)
     finally:
         connection.close()

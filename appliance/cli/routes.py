@@ -70,13 +70,12 @@ def routes(
 
 def _print_bridged(bridged: list[dict[str, Any]]) -> None:
     """A line for each or, where the terminal is too narrow, two."""
-    from appliance.cli.tables import GAP, table, terminal_width, visible
+    from appliance.cli.tables import GAP, fits, table, terminal_width, visible
 
     width = terminal_width()
-    lines = list(table([(*HEAD, *METRICS), *map(_row, bridged)]))
-    if width is None or max(map(len, lines)) <= width:
-        for line in lines:
-            typer.echo(line)
+    rows = [(*HEAD, *METRICS), *map(_row, bridged)]
+    if width is None or fits(rows, width):
+        print_table(rows)
         return
     head, *lines = table([SHORT_HEAD, *map(_short_row, bridged)], width)
     typer.echo(head)

@@ -65,6 +65,11 @@ def table(rows: Iterable[Sequence[str]], width: int | None = None) -> Iterator[s
         yield from _row(row, widths)
 
 
+def fits(rows: Iterable[Sequence[str]], width: int) -> bool:
+    """Whether the table needs no more cells."""
+    return all(cell_len(line) <= width for line in table(rows))
+
+
 def fitted(widths: Sequence[int], room: int) -> list[int]:
     """The widths of columns in so much room: all above a limit get that."""
     if sum(widths) <= room:

@@ -23,6 +23,9 @@ HEAD = (
     "MS",
 )
 
+#: So many columns stay in a line where the terminal is too narrow for all.
+SHORT: Final = 3
+
 #: Of messages of which only the latest of a topic counts: the older ones are not lost.
 REPLACED: Final = "replaced"
 
@@ -47,13 +50,32 @@ def upstream(
     if not links:
         typer.echo("there is no link to a fleet's broker (upstreams in appliance.yaml)")
         return
-    print_table([HEAD, *map(_row, links)])
+    _print_links(links)
     for number, (name, is_warning, text) in enumerate(details(links)):
         if not number:
             typer.echo()
         typer.secho(f"{name}: ", fg="yellow" if is_warning else None, nl=False)
         typer.echo(text.translate(VISIBLE))
     raise typer.Exit(code)
+
+
+def _print_links(links: list[dict[str, Any]]) -> None:
+    """A line for each or, where the terminal is too narrow, two: the other columns below it."""
+    from appliance.cli.tables import GAP, fits, table, terminal_width
+
+    width = terminal_width()
+    rows = [_row(link) for link in links]
+    if width is None or fits([HEAD, *rows], width):
+        print_table([HEAD, *rows])
+        return
+    head, *lines = table([HEAD[:SHORT], *(row[:SHORT] for row in rows)], width)
+    typer.echo(head)
+    for row, line in zip(rows, lines, strict=True):
+        typer.echo(line)
+        counts = zip(HEAD[SHORT:], row[SHORT:], strict=True)
+        told = "; ".join(f"{name.lower()} {value}" for name, value in counts)
+        for more in table([("", told)], width - len(GAP)):
+            typer.echo(f"{GAP}{more}")
 
 
 def details(links: list[dict[str, Any]]) -> Iterator[tuple[str, bool, str]]:

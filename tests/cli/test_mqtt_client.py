@@ -19,6 +19,7 @@ from waiting import PATIENCE
 
 from appliance import certs
 from appliance.cli import main as cli
+from appliance.cli import mqtt_client
 from appliance.mqtt.codec import Property
 from appliance.mqtt.connect import Connack
 from appliance.mqtt.packets import Disconnect, Packet, Puback, Pubcomp, Pubrec, Suback
@@ -130,6 +131,17 @@ def test_too_few_messages_in_time(peer: Peer, capfd: pytest.CaptureFixture[str])
     assert run(peer.arguments("sub", "robot/none", "-W", "0.1")) == 0
     assert run(peer.arguments("sub", "robot/none", "-W", "0.1", "-C", "1")) == 1
     assert "0 of 1 messages came within 0.1 s" in capfd.readouterr().err
+
+
+def test_silence_is_told_once_and_at_a_terminal(
+    peer: Peer, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(mqtt_client, "SILENCE", 0.05)
+    assert run(peer.arguments("sub", "robot/none", "-W", "0.3")) == 0
+    assert capfd.readouterr().err == ""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert run(peer.arguments("sub", "robot/none", "-W", "0.3")) == 0
+    assert capfd.readouterr().err.count("nothing came yet") == 1
 
 
 @pytest.mark.parametrize("version", ["5", "311"])

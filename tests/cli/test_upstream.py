@@ -6,9 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 
 from appliance.cli import main as cli
+from appliance.cli import tables, upstream
 from appliance.ops import control
 from appliance.upstream.backlog_counts import DropReason
 from appliance.upstream.status import LinkStatus
@@ -52,3 +54,19 @@ def test_each_thing_to_know_is_a_line_of_its_own(
         "fleet: dropped of r2/events/#: 3 full",
         r"fleet: set aside 5 min ago, t: no\x0away",
     ]
+
+
+def test_all_columns_are_there_where_the_terminal_is_narrow(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    links = [{**asdict(LINK), "aside": []}]
+    monkeypatch.setattr(upstream, "ask_running", lambda *_: (links, ""))
+    monkeypatch.setattr(tables, "terminal_width", lambda: 60)
+    with pytest.raises(typer.Exit):
+        upstream.upstream()
+    head, link, *more = capsys.readouterr().out.splitlines()
+    assert head.split() == ["NAME", "SERVER", "STATE"]
+    assert link.split() == ["fleet", "mqtts://a:8883", "not", "connected"]
+    text = " ".join(" ".join(more[:2]).split())
+    assert text.startswith("out 0; in 0; waiting 0;") and "dropped 3;" in text
+    assert max(map(len, [head, link, *more[:2]])) <= 60
