@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import psutil
 
@@ -20,7 +20,7 @@ from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.meter import Meter
 from appliance.certs.settings import tls_files
-from appliance.config import Settings, about_size
+from appliance.config import Settings, about_size, format_duration
 from appliance.host.clock import RELEASED, is_unset
 from appliance.net.listeners import Listeners
 from appliance.ros.bridge import Bridge
@@ -339,6 +339,9 @@ _RETAINED: Callable[[Account], int] = attrgetter("retained")
 _RETAINED_BYTES: Callable[[Account], int] = attrgetter("retained_bytes")
 _STORED: Callable[[Account], int] = attrgetter("stored")
 
+#: Seconds for which a message that could not be carried is a problem of its route.
+_RECENT: Final = 600
+
 #: The resources that are measured in bytes.
 _SIZES = ("memory", "retained_bytes", "stored")
 
@@ -381,8 +384,10 @@ def problem_of(route: RouteStatus) -> str | None:
     if not route.topics and route.last_error is not None:
         return f"not bridged: {route.last_error}"
     found = []
-    if route.errors:
-        found.append(f"messages that could not be carried: {route.errors} ({route.last_error})")
+    ago = time.monotonic() - route.last_error_at
+    if route.errors and ago < _RECENT:
+        told = f"the last {format_duration(max(1, round(ago)))} ago: {route.last_error}"
+        found.append(f"messages that could not be carried: {route.errors} ({told})")
     if route.lost:
         found.append(f"messages that ROS's middleware lost on their way here: {route.lost}")
     if route.dropped:

@@ -100,6 +100,8 @@ class RouteStatus:
     byte_rate: float
     latency_ms: LatencyStatus | None
     commanding: tuple[tuple[str, str], ...]
+    #: By `monotonic()`.
+    last_error_at: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +190,7 @@ def route_status(route: BridgeRoute, flows: Sequence[Flow]) -> RouteStatus:
         round(sum(byte_rate for _, byte_rate in rates), 1),
         latency_status(total.latency),
         tuple((flow.ros, flow.commanding) for flow in flows if flow.commanding is not None),
+        total.last_error_at,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from datetime import datetime, timezone
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from command_line import run
 from raw_client import RawClient
 
 from appliance import config
-from appliance.app.status import Status, _shortage, topic_shown
+from appliance.app.status import Status, _shortage, problem_of, topic_shown
 from appliance.broker.broker import Broker
 from appliance.broker.limits import Limits
 from appliance.broker.link import InsideLink
@@ -140,6 +141,17 @@ def test_what_ros_routes_carry_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rates == {"from_ros_a_second": 12.5, "to_ros_a_second": 20.0}
     asked._parts.bridge = None
     assert set(Status._ros_rates(asked).values()) == {0.0}  # type: ignore[arg-type]
+
+
+def test_an_error_of_long_ago_is_no_problem_of_a_route() -> None:
+    def problem(ago: float) -> str | None:
+        counted = {"errors": 1, "last_error": "bad_request", "lost": 0, "dropped": 0}
+        at = time.monotonic() - ago
+        return problem_of(SimpleNamespace(topics=("a",), last_error_at=at, **counted))  # type: ignore[arg-type]
+
+    told = "messages that could not be carried: 1 (the last 5 min ago: bad_request)"
+    assert problem(300) == told
+    assert problem(601) is None
 
 
 def test_who_has_most_is_told_when_little_is_left() -> None:
