@@ -311,6 +311,7 @@ class Broker:
         if holder is account:
             own = self.limits.user.sessions
             self.rate_limited_log.warning(
+                log,
                 self.now,
                 key,
                 "%s makes room for another session of its user: %s has %d sessions, there may be "
@@ -322,6 +323,7 @@ class Broker:
             )
         else:
             self.rate_limited_log.warning(
+                log,
                 self.now,
                 key,
                 "%s makes room for %s: broker.limits.%s is reached, and %s has most of it "
@@ -799,6 +801,7 @@ class Broker:
             link = session.link
             if isinstance(link, InsideLink) and link.must_wait(message, origin.client_id):
                 self.rate_limited_log.warning(
+                    log,
                     self.now,
                     "disk",
                     "%s waits: more comes for %s than the disk takes",
@@ -883,7 +886,7 @@ class Broker:
     def log_rate_limited(self, session: Session, message: str, *args: object) -> None:
         """Log a client's mistake; repetitions are rate limited."""
         key = session.client_id, message
-        self.rate_limited_log.warning(self.now, key, f"%s {message}", session, *args)
+        self.rate_limited_log.warning(log, self.now, key, f"%s {message}", session, *args)
 
     def _log_receiver_full(self, session: Session, message: Message) -> None:
         if session.link is None:

@@ -1124,7 +1124,9 @@ class ClientHandler:
         """Log a warning about the client's address, rate limited for each host."""
         host, _, _ = self.transport.address.rpartition(":")
         now = self._accounting.now
-        self.broker.rate_limited_log.warning(now, (host, message), message, *args, burst=HOST_BURST)
+        self.broker.rate_limited_log.warning(
+            log, now, (host, message), message, *args, burst=HOST_BURST
+        )
 
     def lost(self) -> None:
         """The connection ended without a DISCONNECT."""

@@ -64,7 +64,7 @@ class Faults:
     def _log(self, entry: str, error: BaseException, what: str) -> None:
         place = f"{entry} {type(error).__name__} {_place(error)}"
         if place in self._places or len(self._places) >= PLACES:
-            self._rate_limited_log.warning(self.now, ("fault", entry), "%s", self.last)
+            self._rate_limited_log.warning(log, self.now, ("fault", entry), "%s", self.last)
             return
         self._places.add(place)
         written = self.report(error, what)

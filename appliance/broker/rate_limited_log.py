@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
@@ -30,22 +29,29 @@ class _Entry:
 class RateLimitedLog:
     """Logs warnings, at most BURST for a key in an interval.
 
-    The lines have the name of the caller's module, as if it had logged itself. Suppressed warnings
-    are counted; the count and the last text are logged when the interval ends.
+    Suppressed warnings are counted; the count and the last text are logged when the interval ends.
     """
 
     def __init__(self) -> None:
         self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
 
     def warning(
-        self, now: float, key: Hashable, message: str, *args: object, burst: int = BURST
+        self,
+        log: logging.Logger,
+        now: float,
+        key: Hashable,
+        message: str,
+        *args: object,
+        burst: int = BURST,
     ) -> None:
-        """Log a warning, unless `burst` warnings were logged for this key in this interval."""
+        """Log a warning, unless `burst` warnings were logged for this key in this interval.
+
+        `log` is the logger of the module that warns.
+        """
         entry = self._entries.get(key)
         if entry is None or now - entry.since >= INTERVAL:
             if entry is not None:
                 self._log_suppressed(entry)
-            log = logging.getLogger(sys._getframe(1).f_globals["__name__"])
             entry = self._entries[key] = _Entry(now, log)
             if len(self._entries) > MAXIMUM_KEYS:
                 self._log_suppressed(self._entries.popitem(last=False)[1])

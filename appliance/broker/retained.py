@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import logging
 from collections.abc import Callable, Iterator
 from typing import Final
 
@@ -15,6 +16,8 @@ from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.broker.session import LEVEL_SIZE
 from appliance.mqtt.codec import quote, text_size
 from appliance.mqtt.topics import TopicTree
+
+log = logging.getLogger(__name__)
 
 #: The cost of retaining or deleting a message; LEVELS_PER_COST_UNIT levels of the topic add one.
 RETAIN_COST = 3
@@ -170,6 +173,7 @@ class RetainedMessages:
 
     def _log_no_room(self, message: Message, owner: Account, shortage: str) -> None:
         self._rate_limited_log.warning(
+            log,
             self._accounting.now,
             ("retained", owner.username),
             "no room to retain %s: %s; %s has %d retained messages with %d bytes, of %d with %d in "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import math
 import os
 import socket
@@ -31,6 +32,8 @@ from appliance.net import lingering, tls
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.scheduler import PUBLISH_BURST, Scheduler
 from appliance.net.sockets import Probe, peer_status, receive_buffer
+
+log = logging.getLogger(__name__)
 
 #: Bytes of output from which on a client counts as slow, and is sent no more until it has read
 #: them. A healthy client reads less than this in one round of the event loop.
@@ -282,7 +285,7 @@ class ClientConnection:
         """Log why the connection is refused or ended, at a limited rate for each host and kind."""
         now = self._loop.time()
         message = f"{self.address}: {what}: {why:.200}"
-        self._broker.rate_limited_log.warning(now, (self.host, what), "%s", message)
+        self._broker.rate_limited_log.warning(log, now, (self.host, what), "%s", message)
         if self._broker.audit_log is not None:
             self._broker.audit_log.refused(self.address, f"{what}: {why}")
 
@@ -453,6 +456,7 @@ class ClientConnection:
             # No longer: it may be this client's acknowledgements that would free the memory.
             self._rest(SHORT_OF_MEMORY_PAUSE)
             self._broker.rate_limited_log.warning(
+                log,
                 self._accounting.now,
                 "memory",
                 "%s is slowed: %d bytes are in use, of the %d allowed (broker.limits.memory)",
@@ -698,6 +702,7 @@ class ClientConnection:
 
     def _log_slow(self) -> None:
         self._broker.rate_limited_log.warning(
+            log,
             self._loop.time(),
             "slow",
             "%s is slow: it does not read %d bytes, and is sent nothing more until it does",
@@ -810,6 +815,7 @@ class ClientConnection:
         if self._turns_taken == MANY_TURNS:
             self._turns_taken = 0
             self._broker.rate_limited_log.warning(
+                log,
                 self._accounting.now,
                 "turns",
                 "%s asks for more than there is time for, and is read later",

@@ -248,7 +248,9 @@ class Listeners:
         refusal = (self._addresses.reserve(host, now) if host else "") or self._make_room()
         if refusal:
             self.broker.counters.connections_refused += 1
-            self.broker.rate_limited_log.warning(now, refusal, "%s refused: %s", address, refusal)
+            self.broker.rate_limited_log.warning(
+                log, now, refusal, "%s refused: %s", address, refusal
+            )
             if self.broker.audit_log is not None:
                 self.broker.audit_log.refused(address, refusal)
         return refusal

@@ -483,7 +483,7 @@ class Backlog:
             "the backlog of %s: the disk is too slow for %s, messages of QoS 0 or from ROS are "
             "dropped"
         )
-        self._log.warning(now, queue.name, text, self._name, queue.name, burst=1)
+        self._log.warning(log, now, queue.name, text, self._name, queue.name, burst=1)
 
     # --- the journals -----------------------------------------------------------------------------
 

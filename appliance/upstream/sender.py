@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -19,6 +20,8 @@ from appliance.upstream.refusals import message_advice, reason_words
 from appliance.upstream.rule_queue import Entry
 from appliance.upstream.rules import UpstreamSettings
 from appliance.upstream.transport import WRITE_PORTION
+
+log = logging.getLogger(__name__)
 
 #: The wall clock below which it was not set.
 _RELEASED: Final = RELEASED.timestamp()
@@ -256,6 +259,7 @@ class Sender:
     def _set_aside(self, entry: Entry, reason: str) -> None:
         now = self._clock()
         self._log.warning(
+            log,
             now,
             entry.record.rule,
             "upstream '%s': a message for %s is set aside: %s",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import logging
 import ssl
 from collections.abc import Callable, Coroutine
 from typing import Protocol
@@ -14,6 +15,8 @@ from appliance.broker.values import WRONG_LOGIN, Action, Decision, Identity, Ref
 from appliance.mqtt.codec import quote
 from appliance.net import tls
 from appliance.net.http import HttpRequest, HttpResponse, text
+
+log = logging.getLogger(__name__)
 
 #: Seconds after which a client may come again that was not checked.
 RETRY_AFTER = 5
@@ -100,6 +103,7 @@ class WebLogin:
         broker.counters.logins_failed += refusal.code in WRONG_LOGIN
         user = "no user name" if username is None else f"user {quote(username)}"
         broker.rate_limited_log.warning(
+            log,
             self._clock(),
             (request.peer, "http login"),
             "HTTP (%s) at %s refused: %s",

@@ -85,7 +85,7 @@ def test_what_pubrec_took_is_kept_though_the_queue_filled_meanwhile(join: Join):
 def test_a_line_has_the_name_of_who_logs(caplog: pytest.LogCaptureFixture):
     limited = RateLimitedLog()
     for number in range(BURST + 1):
-        limited.warning(0.0, "key", "number %d", number)
+        limited.warning(logging.getLogger(__name__), 0.0, "key", "number %d", number)
     limited.tick(INTERVAL)
     assert {record.name for record in caplog.records} == {__name__}
     assert caplog.messages[-1] == f"1 more of this kind, the last: number {BURST}"
