@@ -446,6 +446,7 @@ class _Losses:
         kind = getattr(implementation, "EventHandle", None) or implementation.QoSEvent
         self._refusals = _errors()
         self._event: Any = None
+        self._total = 0
         with suppress(implementation.UnsupportedEventTypeError, *self._refusals), handle:
             self._event = kind(handle, kinds.RCL_SUBSCRIPTION_MESSAGE_LOST)
 
@@ -454,8 +455,12 @@ class _Losses:
             return 0
         with suppress(*self._refusals), self._event:
             status = self._event.take_event()
-            # Fast DDS now and then reports a change with the sign bit set: 2**64 - 2**31 more.
-            return int(status.total_count_change) & 0x7FFF_FFFF if status is not None else 0
+            if status is None:
+                return 0
+            # Not its change since the last time, of which a part is gone when the middleware counts
+            # meanwhile. Fast DDS now and then sets the sign bit: 2**64 - 2**31 more.
+            before, self._total = self._total, int(status.total_count)
+            return (self._total - before) & 0x7FFF_FFFF
         return 0
 
     def destroy(self) -> None:
