@@ -92,7 +92,8 @@ def _hang(tmp_path: Path, notify: NotifySocket) -> None:
         appliance.stop()
     report = path.read_text()
     assert path.parent == tmp_path / "state/crashes" and path.stat().st_mode & 0o777 == 0o600
-    assert "robot: r2d2" in report and "Current thread" in report
+    # The kernel may give the signal to a thread that is none of Python's: then none is the current.
+    assert "robot: r2d2" in report and "hread 0x" in report
     assert list(path.parent.iterdir()) == [path], "nothing else is left by a clean end"
 
 
