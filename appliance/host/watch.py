@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
@@ -53,13 +54,18 @@ async def watch(
             yield_on_timeout=True,
             recursive=False,
         ):
-            found = {path: _stamp(path) for path in wanted}
+            # In a thread, as a file system may hang, and everybody would wait with it.
+            found = await asyncio.to_thread(_stamps, wanted)
             if found == seen:
                 continue
             seen, since = found, time.time()
             await changed()
             if _with_targets(files()) != wanted:
                 break
+
+
+def _stamps(paths: Iterable[Path]) -> dict[Path, _Stamp]:
+    return {path: _stamp(path) for path in paths}
 
 
 def _stamp(path: Path) -> _Stamp:
