@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,15 +51,11 @@ def user_add(
             raise CommandError(
                 f"there is a user {name!r} already; `appliance user passwd` changes it"
             )
-        _set_password(
-            users,
-            name,
-            password_file,
-            generate,
-            scram,
-            # Before the user can log in, and only if there are such groups.
-            before_saving=lambda: _join(settings, name, group or []),
-        )
+        password = _set_password(users, name, password_file, generate, scram)
+        if group:  # before the user can log in, and only if there are such groups
+            _join(settings, name, group)
+        users.save()
+        _show(password, generate)
     typer.echo(f"user {name} added to {shown(users.path)}")
     _say_without_rules(settings, name)
     _note(settings, "user added", name)
@@ -85,7 +81,9 @@ def user_passwd(
     with _users(settings) as users:
         if name not in users.users():
             raise CommandError(_no_user(name, users))
-        _set_password(users, name, password_file, generate, scram)
+        password = _set_password(users, name, password_file, generate, scram)
+        users.save()
+        _show(password, generate)
     typer.echo(f"password of user {name} changed")
     _note(settings, "password changed", name)
 
@@ -156,8 +154,10 @@ def _no_user(name: str, users: Passwords) -> str:
 def _join(settings: Settings, name: str, wanted: list[str]) -> None:
     from appliance.access import groups
 
-    if wanted:
+    try:
         groups.join(settings.broker.acl, settings.robot, name, wanted)
+    except ValueError as error:
+        raise CommandError(str(error)) from None
 
 
 def _say_without_rules(settings: Settings, name: str) -> None:
@@ -178,21 +178,19 @@ def _say_without_rules(settings: Settings, name: str) -> None:
 
 
 def _set_password(
-    users: Passwords,
-    name: str,
-    file: str | None,
-    generate: bool,
-    scram: bool | None,
-    before_saving: Callable[[], None] = lambda: None,
-) -> None:
+    users: Passwords, name: str, file: str | None, generate: bool, scram: bool | None
+) -> str:
+    """The new password, which is not saved yet."""
     password = new_password(name, file, generate)
     try:
         users.set(name, password, scram)
-        before_saving()
     except ValueError as error:
         raise CommandError(str(error)) from None
-    users.save()
-    if generate:
+    return password
+
+
+def _show(password: str, is_generated: bool) -> None:
+    if is_generated:
         typer.echo(f"password {password}")
 
 
