@@ -245,8 +245,10 @@ async def test_values_that_are_more_work_than_their_bytes(web: WebApp):
     """All others would wait for a tenth of a second while they are read."""
     lists = b'{"topic": "r2d2/a", "payload": [%s[]]}' % (b"[]," * 300_000)
     text = b'{"topic": "r2d2/a", "payload": "%s"}' % (b"[]," * 300_000)
+    deep = b'{"topic": "r2d2/a", "payload": %s%s}' % (b"[" * 100_000, b"]" * 100_000)
     for path in ("publish", "call"):
         assert (await post(web, path, lists))[0] == 413
+        assert (await post(web, path, deep))[0] == 413
     assert (await post(web, "publish", text))[0] == 200
 
 

@@ -14,9 +14,11 @@ from harness import Harness, make_contexts
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish, Suback, Subscribe, Subscription
 from appliance.mqtt.reason import ReasonCode
+from appliance.net.connection import WRITE_PORTION
 
 __all__ = ["event_loop_policy"]
 
+JPEG = {Property.CONTENT_TYPE: "image/jpeg"}  # with properties a message is encoded for each
 RATE = {Property.USER_PROPERTY: [("max-rate", "10")]}
 
 
@@ -55,3 +57,23 @@ async def test_a_viewer_gets_the_newest_of_each_topic_and_the_last(harness: Harn
     assert len(came) <= 4 * (2 + took / 0.1)
     assert harness.broker.counters.publish_throttled + len(came) == 100
     assert harness.broker.faults.count == 0
+
+
+@pytest.mark.parametrize("rate", ["1000", None])
+async def test_pictures_for_a_viewer_that_does_not_read(harness: Harness, rate: str | None) -> None:
+    """One picture is on its way to it, and one waits; the other viewer gets all of them."""
+    stalled, viewer, publisher = [
+        await harness.log_in(name) for name in ("stalled", "viewer", "publisher")
+    ]
+    fast = {Property.USER_PROPERTY: [("max-rate", rate)]} if rate else None
+    for each in (viewer, stalled):
+        await each.send(Subscribe(1, [Subscription("camera")], fast))
+        await each.receive()
+    size, most = 1_000_000, 0
+    for number in range(90):
+        picture = b"%04d" % number + bytes(size)
+        await publisher.send(Publish("camera", picture, properties=JPEG))
+        packet = await viewer.receive()
+        assert isinstance(packet, Publish) and packet.payload == picture
+        most = max(most, harness.broker.accounting.queued_bytes)
+    assert size < most <= 2 * size + WRITE_PORTION
