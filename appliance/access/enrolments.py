@@ -37,11 +37,13 @@ _Stored: TypeAlias = "tuple[str | None, str | None]"
 class Enrolment:
     """Whose password is set, and who has begun it, None for the control socket.
 
-    `groups` are those of a user that is made with it; None for one that is there.
+    `groups` are those of a user that is made with it; None for one that is there. With
+    `with_certificate` its phone gets a key and certificate of its own as well.
     """
 
     username: str
     groups: tuple[str, ...] | None
+    with_certificate: bool
     by: Identity | None
     ends_at: float
     #: The hashes of the passwords of both then, see `Enrolments._stored`.
@@ -58,7 +60,11 @@ class Enrolments:
         self._pending: dict[bytes, Enrolment] = {}
 
     def begin(
-        self, username: str, groups: tuple[str, ...] | None, by: Identity | None
+        self,
+        username: str,
+        groups: tuple[str, ...] | None,
+        by: Identity | None,
+        with_certificate: bool = False,
     ) -> str | None:
         """A new code in the place of an earlier one of this user; None when there are too many."""
         now = self._clock()
@@ -71,7 +77,9 @@ class Enrolments:
             return None
         code = secrets.token_urlsafe(_RANDOM)
         stored = self._stored(username, groups, by)
-        self._pending[self._digest(code)] = Enrolment(username, groups, by, now + LIFETIME, stored)
+        self._pending[self._digest(code)] = Enrolment(
+            username, groups, with_certificate, by, now + LIFETIME, stored
+        )
         return code
 
     def take(self, code: str) -> Enrolment | None:

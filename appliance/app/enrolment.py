@@ -8,6 +8,7 @@ passwords are, and noted with them.
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -74,12 +75,16 @@ def enrol(parts: EnrolmentParts) -> Resource:
             parts.login.note(request, None, _UNKNOWN)
             return text(403, "this code was used, has ended, or is not of here")
         try:
-            await carry_out(parts.broker, verbs, enrolment, password, request.address)
+            done = await carry_out(parts.broker, verbs, enrolment, password, request.address)
         except CallError as error:
             if error.code == "bad_request":  # the password: another one may be better
                 parts.enrolments.put_back(code, enrolment)
             return text(_STATUS.get(error.code, 409), str(error))
         answer = {"user": enrolment.username, "mqtt_port": parts.mqtt_port()}
+        if enrolment.with_certificate:
+            packed = done.pkcs12
+            answer["p12"] = None if packed is None else base64.b64encode(packed).decode()
+            answer["problem"] = done.problem
         return HttpResponse(200, json.dumps(answer).encode(), "application/json")
 
     return Resource(respond, ("POST",))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.access import FileAccess
@@ -55,6 +56,9 @@ def verbs(parts: ManagementParts) -> Verbs:
     """All of them."""
     reload = parts.outcome
 
+    def directory() -> Path | None:
+        return authority_directory(reload.settings.broker)
+
     async def take_over() -> None:
         try:
             await parts.reload()
@@ -67,8 +71,8 @@ def verbs(parts: ManagementParts) -> Verbs:
         *RightsVerbs(parts.broker, parts.access).verbs(),
         *UserVerbs(parts.access, take_over).verbs(),
         *TokenVerbs(parts.broker, parts.access).verbs(),
-        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments).verbs(),
-        *CertificateVerbs(lambda: authority_directory(reload.settings.broker), take_over).verbs(),
+        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, directory).verbs(),
+        *CertificateVerbs(directory, take_over).verbs(),
         # Its path changes with a restart only.
         *RecordVerbs(reload.settings.broker.audit.path).verbs(),
     ]

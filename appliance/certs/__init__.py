@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from appliance.certs.addresses import Address, local_names
 from appliance.certs.authority import (
+    check_client_name,
     create_authority,
     issue_client,
     issue_server,
@@ -23,13 +24,13 @@ from appliance.certs.contexts import (
     load_tls,
     server_context,
 )
-from appliance.certs.export import check_password, write_bundle, write_pkcs12
+from appliance.certs.export import check_password, pkcs12, write_bundle, write_pkcs12
 from appliance.certs.files import CertificateError, issued_by, load_certificates, load_key
 from appliance.certs.identity import username_of
 from appliance.certs.listing import Expiry, ListedCertificate, expiries, list_certificates
 from appliance.certs.registry import Issued
 from appliance.certs.renewal import keep_server_certificate, server_outside, server_revoked
-from appliance.certs.requests import REQUEST_SIZE
+from appliance.certs.requests import REQUEST_SIZE, new_request
 
 __all__ = [
     "REQUEST_SIZE",
@@ -43,6 +44,7 @@ __all__ = [
     "TlsContexts",
     "TlsFiles",
     "TlsPolicy",
+    "check_client_name",
     "check_password",
     "create_authority",
     "expiries",
@@ -56,6 +58,8 @@ __all__ = [
     "load_key",
     "load_tls",
     "local_names",
+    "new_request",
+    "pkcs12",
     "renew",
     "revoke",
     "server_context",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, PrivateFormat
@@ -14,7 +16,14 @@ from cryptography.hazmat.primitives.serialization.pkcs12 import (
 )
 
 from appliance.certs.authority import check_client_name
-from appliance.certs.files import CertificateError, key_pem, load_certificates, load_key, write
+from appliance.certs.files import (
+    CertificateError,
+    key_pem,
+    load_certificates,
+    load_key,
+    parse_certificates,
+    write,
+)
 
 SHORTEST_PASSWORD: Final = 8
 _ROUNDS: Final = 100_000
@@ -36,6 +45,32 @@ def write_pkcs12(directory: Path, name: str, password: str) -> Path:
     check_password(password)
     path, key = _key_of(directory, name)
     certificate = load_certificates(path.with_name(f"{name}.crt"))[0]
+    authorities = load_certificates(directory / "ca.crt")
+    target = path.with_name(f"{name}.p12")
+    write(target, _packed(name, key, certificate, authorities, password), 0o600)
+    return target
+
+
+def pkcs12(
+    name: str, key: ec.EllipticCurvePrivateKey, certificate: bytes, authority: bytes, password: str
+) -> bytes:
+    """What `write_pkcs12` writes, of a key that is in no file and of two certificates in PEM.
+
+    CertificateError when the password is too short.
+    """
+    check_password(password)
+    own = parse_certificates(Path(f"{name}.crt"), certificate)[0]
+    authorities = parse_certificates(Path("ca.crt"), authority)
+    return _packed(name, key, own, authorities, password)
+
+
+def _packed(
+    name: str,
+    key: ec.EllipticCurvePrivateKey,
+    certificate: x509.Certificate,
+    authorities: Sequence[x509.Certificate],
+    password: str,
+) -> bytes:
     # Not AES, which iOS before 16, Android before 13 and Windows 10 refuse as a wrong password. The
     # number of rounds and the password's length make up for it.
     encryption = (
@@ -45,11 +80,7 @@ def write_pkcs12(directory: Path, name: str, password: str) -> Path:
         .hmac_hash(hashes.SHA1())
         .build(password.encode())
     )
-    authorities = load_certificates(directory / "ca.crt")
-    data = serialize_key_and_certificates(name.encode(), key, certificate, authorities, encryption)
-    target = path.with_name(f"{name}.p12")
-    write(target, data, 0o600)
-    return target
+    return serialize_key_and_certificates(name.encode(), key, certificate, authorities, encryption)
 
 
 def write_bundle(directory: Path, name: str) -> Path:

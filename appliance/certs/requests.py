@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from cryptography import x509
+from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
+from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
 from appliance.certs.files import MALFORMED, CertificateError
@@ -24,6 +26,14 @@ class Request:
 
     key: CertificatePublicKeyTypes
     name: str | None
+
+
+def new_request(name: str) -> tuple[ec.EllipticCurvePrivateKey, bytes]:
+    """A new key, in memory only, and the request in PEM for a certificate of it."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    builder = x509.CertificateSigningRequestBuilder().subject_name(subject)
+    return key, builder.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM)
 
 
 def load_request(data: bytes) -> Request:

@@ -25,6 +25,10 @@ def user_enrol(
     group: Annotated[
         list[str] | None, typer.Option(metavar="GROUP", help="A group of the new user; repeatable.")
     ] = None,
+    certificate: Annotated[
+        bool,
+        typer.Option("--certificate", help="The phone gets a certificate too, as a .p12 file."),
+    ] = False,
     origin: Annotated[
         str | None,
         typer.Option(
@@ -40,8 +44,12 @@ def user_enrol(
     """
     if group and not new:
         raise typer.BadParameter("--group is for a --new user")
-    arguments = {"user": name, "origin": origin or _origin(options)}
-    answer = options.ask("enrol", {**arguments, "groups": group or []} if new else arguments)
+    arguments: dict[str, object] = {"user": name, "origin": origin or _origin(options)}
+    if new:
+        arguments["groups"] = group or []
+    if certificate:
+        arguments["certificate"] = True
+    answer = options.ask("enrol", arguments)
     import segno
 
     segno.make(answer["url"], micro=False).terminal(sys.stdout, compact=True)

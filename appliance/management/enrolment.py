@@ -1,24 +1,29 @@
 """The verb `enrol`: a one-time code with which a phone sets its user's password.
 
 A code is worth the right to add that user, or to change its password, and is given to nobody
-without that right. When it is used, the same is asked again.
+without that right. When it is used, the same is asked again. With a certificate, the phone gets a
+PKCS #12 file for its MQTT apps, under the password that it has chosen. The key is made then, and
+kept nowhere: phones import such files, and make no requests.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Final
 from urllib.parse import quote
 
 from pydantic import Field
 
+from appliance import certs
 from appliance.access import FileAccess, check_username
 from appliance.access import groups as acl_groups
 from appliance.access.enrolments import LIFETIME, Enrolment, Enrolments
 from appliance.broker.broker import Broker
 from appliance.broker.values import Identity
+from appliance.certs import CertificateError
 from appliance.management.topics import topic_of
 from appliance.management.users import GroupNames, UserName
 from appliance.management.verbs import Arguments, Caller, Verb, Verbs
@@ -27,26 +32,47 @@ from appliance.ros.calls.dispatcher import CallError
 #: The most characters of a user's name that the URL says as well, for who looks at it.
 _SHOWN: Final = 60
 
+#: The verb that makes the certificate.
+_SIGN: Final = "certificate_sign"
+
 #: Scheme, host and port of the console, as the phone reaches it.
 Origin = Annotated[str, Field(max_length=300, pattern=r"^https?://[A-Za-z0-9.:\[\]_-]+$")]
 
 
 @dataclass(eq=False)
 class Enrol(Arguments):
-    """A user that is there, or with `groups` a new one; and where its phone finds the console."""
+    """A user that is there, or with `groups` a new one; where its phone finds the console; and
+    whether that gets a certificate of its own."""
 
     user: UserName
     origin: Origin
     groups: GroupNames | None = None
+    certificate: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolled:
+    """What the phone gets: with a certificate its file, or why there is none."""
+
+    pkcs12: bytes | None = None
+    problem: str = ""
 
 
 class EnrolmentVerb:
     """Begins enrolments."""
 
-    def __init__(self, broker: Broker, access: FileAccess, enrolments: Enrolments) -> None:
+    def __init__(
+        self,
+        broker: Broker,
+        access: FileAccess,
+        enrolments: Enrolments,
+        directory: Callable[[], Path | None],
+    ) -> None:
+        """`directory` is that of the CA, None where it is another's."""
         self._broker = broker
         self._access = access
         self._enrolments = enrolments
+        self._directory = directory
 
     def verbs(self) -> Iterator[Verb[Any]]:
         """The verb."""
@@ -64,7 +90,10 @@ class EnrolmentVerb:
         check_right(self._broker, caller.identity, _verb_for(groups))
         if groups is not None:
             await self._check_new(wanted.user, groups)
-        code = self._enrolments.begin(wanted.user, groups, caller.identity)
+        if wanted.certificate:
+            check_right(self._broker, caller.identity, _SIGN)
+            await self._check_certificate(wanted.user)
+        code = self._enrolments.begin(wanted.user, groups, caller.identity, wanted.certificate)
         if code is None:
             raise CallError("too_many", "too many enrolments wait for their phones")
         named = f"/{quote(wanted.user, safe='')}" if len(wanted.user) <= _SHOWN else ""
@@ -83,20 +112,60 @@ class EnrolmentVerb:
         except ValueError as error:
             raise CallError("bad_request", str(error)) from None
 
+    async def _check_certificate(self, user: str) -> None:
+        """As `_check_new`."""
+        directory = self._directory()
+        if directory is None:
+            raise CallError("rejected", "the certificates are not of this appliance's own CA")
+        try:
+            certs.check_client_name(user)
+            listed = await asyncio.to_thread(lambda: certs.list_certificates(directory))
+        except CertificateError as error:
+            raise CallError("rejected", str(error)) from None
+        if any(each.name == user and each.state == "valid" for each in listed):
+            raise CallError(
+                "rejected",
+                f"{user!r} has a certificate, of another key: revoke that first, or enrol this "
+                "device without one",
+            )
+
 
 async def carry_out(
     broker: Broker, verbs: Verbs, enrolment: Enrolment, password: str, address: str
-) -> None:
+) -> Enrolled:
     """Set the password, as the one who has begun the enrolment; from the phone's address.
 
-    Raises CallError.
+    Raises CallError, and then nothing has changed. A certificate that is refused is none of that:
+    the password is set by then.
     """
+    if enrolment.with_certificate:
+        try:
+            certs.check_password(password)
+        except CertificateError as error:
+            raise CallError("bad_request", str(error)) from None
     verb = _verb_for(enrolment.groups)
     check_right(broker, enrolment.by, verb)
     values: dict[str, Any] = {"user": enrolment.username, "password": password}
     if enrolment.groups is not None:
         values["groups"] = list(enrolment.groups)
-    await verbs.run(Caller(enrolment.by, address), verb, values)
+    caller = Caller(enrolment.by, address)
+    await verbs.run(caller, verb, values)
+    if not enrolment.with_certificate:
+        return Enrolled()
+    try:
+        check_right(broker, enrolment.by, _SIGN)
+        return Enrolled(await _certified(verbs, caller, enrolment.username, password))
+    except (CallError, CertificateError) as error:
+        return Enrolled(problem=str(error))
+
+
+async def _certified(verbs: Verbs, caller: Caller, name: str, password: str) -> bytes:
+    """Key and certificate, as PKCS #12."""
+    key, request = certs.new_request(name)
+    made: Any = await verbs.run(caller, _SIGN, {"request": request.decode(), "name": name})
+    certificate, authority = made["certificate"].encode(), made["ca"].encode()
+    # A fifth of a second, for which the lock of the interpreter is given up.
+    return await asyncio.to_thread(certs.pkcs12, name, key, certificate, authority, password)
 
 
 def check_right(broker: Broker, identity: Identity | None, verb: str) -> None:
@@ -133,4 +202,5 @@ def _picture(url: str) -> dict[str, Any]:
 
 def _named(wanted: Enrol) -> dict[str, Any]:
     groups = {} if wanted.groups is None else {"groups": ", ".join(wanted.groups)}
-    return {"of": wanted.user, **groups}
+    certificate = {"certificate": "yes"} if wanted.certificate else {}
+    return {"of": wanted.user, **groups, **certificate}

@@ -11,11 +11,14 @@ from typing import Any
 
 import pytest
 from both_loops import event_loop_policy as event_loop_policy
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import pkcs12
 from http_client import ask
 from web_app import WebApp
 
+from appliance import certs
 from appliance.access import Passwords
-from appliance.app import enrolment
+from appliance.app import enrolment, management
 from appliance.broker.values import Identity
 from appliance.management.verbs import LOCAL, Caller
 from appliance.net.http import HttpRequest
@@ -198,3 +201,66 @@ async def test_changes_are_noted_without_the_secrets(web: WebApp, caplog: pytest
     assert "enrolment begun" in caplog.text and "user added" in caplog.text
     assert "user 'admin'" in caplog.text
     assert code not in caplog.text and "a secret" not in caplog.text
+
+
+async def test_a_certificate_for_the_phone(web: WebApp):
+    """The key is in the file that the phone gets, and in none of this computer."""
+    code = await begin(web, "carol", groups=[], certificate=True)
+    status, body = await use(web, code, "short")
+    assert status == 400 and "8 characters" in body and not web.app._access.knows("carol")
+    status, body = await use(web, code, "long enough")
+    assert status == 200
+    answer = json.loads(body)
+    assert answer["problem"] == ""
+    packed = base64.b64decode(answer["p12"])
+    with pytest.raises(ValueError):
+        pkcs12.load_pkcs12(packed, b"short")
+    opened = pkcs12.load_pkcs12(packed, b"long enough")
+    assert opened.key is not None and opened.cert is not None
+    assert isinstance(opened.key, ec.EllipticCurvePrivateKey)
+    directory = web.directory / "certs"
+    listed = {each.name: each for each in certs.list_certificates(directory)}
+    assert listed["carol"].state == "valid"
+    certificate = opened.cert.certificate
+    assert certs.username_of(certificate, "subject") == "carol"
+    assert certificate.public_key() == opened.key.public_key()
+    assert [each.certificate for each in opened.additional_certs] == certs.load_certificates(
+        directory / "ca.crt"
+    )
+    assert [path.name for path in (directory / "clients").iterdir()] == ["carol.crt"]
+    with pytest.raises(CallError, match="revoke that first"):
+        await begin(web, "carol", certificate=True)
+    await call(web, "certificate_revoke", certificate="carol")
+    again = json.loads(
+        (await use(web, await begin(web, "carol", certificate=True), "again_" * 2))[1]
+    )
+    assert again["problem"] == "" and again["p12"] != answer["p12"]
+
+
+async def test_a_certificate_takes_the_right_to_sign(web: WebApp):
+    """It is asked twice; whoever loses it in between leaves the password, and no certificate."""
+    with pytest.raises(CallError, match="certificate_sign/_call"):
+        await begin(web, "carol", HELPER, groups=[], certificate=True)
+    rules = web.directory / "acl.conf"
+    rules.write_text(RULES + "topic write $CONTROL/appliance/v1/certificate_sign/_call\n")
+    await web.app.reload()
+    code = await begin(web, "carol", HELPER, groups=[], certificate=True)
+    rules.write_text(RULES)
+    await web.app.reload()
+    status, body = await use(web, code, "long enough")
+    answer = json.loads(body)
+    assert status == 200 and answer["p12"] is None and "certificate_sign" in answer["problem"]
+    assert web.app._access.knows("carol")
+    assert not (web.directory / "certs/clients").exists()
+
+
+async def test_names_that_no_certificate_can_have(web: WebApp):
+    for name in ("carol/ä", "x" * 65, "server"):
+        with pytest.raises(CallError, match="cannot name a client's certificate"):
+            await begin(web, name, groups=[], certificate=True)
+
+
+async def test_the_certificates_of_another_authority(web: WebApp, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(management, "authority_directory", lambda settings: None)
+    with pytest.raises(CallError, match="not of this appliance's own CA"):
+        await begin(web, "carol", groups=[], certificate=True)

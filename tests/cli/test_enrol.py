@@ -37,6 +37,11 @@ async def test_a_code_in_the_terminal(
         assert taken is not None and taken.username == "viewer" and taken.by is None
         code, text = await told("new", "--new", "--user", "admin", *afar)
         assert code == 0 and "https://localhost:8443/#/enrol/" in text
+        code, text = await told("crane", "--new", "--certificate", "--user", "admin", *afar)
+        found = re.search(r"/enrol/([\w-]{32})/crane", text)
+        assert code == 0 and found is not None
+        taken = site.app._enrolments.take(found[1])
+        assert taken is not None and taken.with_certificate and taken.groups == ()
         code, text = await told("viewer", "--user", "viewer", *afar)
         assert code == 1 and "topic write $CONTROL/appliance/v1/enrol/_call/#" in text
         assert (await told("nobody", "--origin", "https://robot", *here))[0] == 1

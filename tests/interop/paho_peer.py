@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import socket
 import threading
+from pathlib import Path
 from typing import Any
 
 from appliance_process import HOST, BrokerProcess
@@ -32,7 +33,7 @@ class Peer:
     """A client of one broker through TLS; `start` connects it.
 
     `expiry` is how many seconds the session is kept; 0 ends it with the connection. In MQTT 3.1.1
-    any other value stands for "not clean".
+    any other value stands for "not clean". `certificate` names the files of certificate and key.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class Peer:
         client_id: str = "",
         *,
         user: str = "alice",
+        certificate: tuple[Path, Path] | None = None,
         clean: bool = True,
         expiry: int = 0,
         receive_maximum: int | None = None,
@@ -68,7 +70,10 @@ class Peer:
             manual_ack=manual_ack,
             **keeping,
         )
-        self.client.tls_set_context(broker.tls_context())
+        context = broker.tls_context()
+        if certificate is not None:
+            context.load_cert_chain(*certificate)
+        self.client.tls_set_context(context)
         self.client.username_pw_set(user, broker.passwords[user])
         self.client.on_connect = self._on_connect
         self.client.on_disconnect = self._on_disconnect

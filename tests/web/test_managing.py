@@ -14,7 +14,12 @@ from appliance_process import ROBOT, ApplianceProcess
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    pkcs12,
+)
 from cryptography.x509.oid import NameOID
 from interop.paho_peer import V5, Peer
 from visits import DESKTOP, PHONE, Visit
@@ -178,13 +183,15 @@ def photographed(page: Any) -> str:
     return str(codes[0].text)
 
 
-def begin_enrolment(page: Any, user: str, group: str = "") -> str:
+def begin_enrolment(page: Any, user: str, group: str = "", certificate: bool = False) -> str:
     """The URL in the QR code."""
     page.click("summary:has-text('Enrol a phone')")
     form = page.locator("details:has(summary:has-text('Enrol a phone')) form")
     form.locator("input[name=user]").fill(user)
     if group:
         form.locator(f"label:has-text('{group}') input").check()
+    if certificate:
+        form.locator("input[name=certificate]").check()
     form.locator("button").click()
     page.wait_for_selector(".code svg")
     page.locator(".code svg").scroll_into_view_if_needed()
@@ -228,6 +235,32 @@ def test_enrol_a_phone(
     assert [told for told in late.wrong if "403" not in told] == []
     late.wrong.clear()
     assert password not in appliance.log and url.rpartition("#")[2] not in appliance.log
+
+
+def test_enrol_a_phone_with_a_certificate(
+    visit: Callable[..., Visit], appliance: ApplianceProcess, tmp_path: Path
+) -> None:
+    """An MQTT app shows what is in the file that the page gives, and is the user."""
+    admin = visit(**DESKTOP).sign_in(page="Access")
+    admin.wait_for_selector("text=/ users$/")
+    url = begin_enrolment(admin, "crane", "viewers", certificate=True)
+    visited = visit(**PHONE)
+    phone = visited.page
+    phone.goto(url)
+    phone.fill("input[name=password]", "chosen-by-crane")
+    phone.click("button:text-is('Set it and sign in')")
+    with phone.expect_download() as downloaded:
+        phone.click("a:has-text('crane.p12')")
+    visited.look("phone-enrolled-certificate")
+    assert downloaded.value.suggested_filename == "crane.p12"
+    opened = pkcs12.load_pkcs12(downloaded.value.path().read_bytes(), b"chosen-by-crane")
+    assert opened.key is not None and opened.cert is not None
+    key, certificate = tmp_path / "crane.key", tmp_path / "crane.crt"
+    key.write_bytes(opened.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    certificate.write_bytes(opened.cert.certificate.public_bytes(Encoding.PEM))
+    appliance.passwords["crane"] = "chosen-by-crane"
+    peer = Peer(appliance, V5, "crane's app", user="crane", certificate=(certificate, key))
+    peer.start().stop()
 
 
 def test_another_password_for_who_is_there(

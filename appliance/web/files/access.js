@@ -18,7 +18,7 @@ export default function Access({ topic }) {
     ${part === 'users' ? html`<${Users} />` : part === 'explain' ? html`<${Explain} />` : html`<${Certificates} />`}`
 }
 
-const USERS = ['users', 'user_add', 'user_password', 'user_remove', 'user_groups', 'enrol']
+const USERS = ['users', 'user_add', 'user_password', 'user_remove', 'user_groups', 'enrol', 'certificate_sign']
 
 function Users() {
   const rights = useRights(USERS)

@@ -13,10 +13,12 @@ export function EnrolPhone({ users, groups, rights }) {
   const [begun, setBegun] = useState(null)
   const [name, setName] = useState('')
   const isThere = users?.some(({ user }) => user === name) ?? false
+  const lackingSign = lack(rights, 'certificate_sign')
   const act = async (fields) => {
     setBegun(null)
     const values = { user: name, origin: fields.origin.value.replace(/\/+$/, '') }
     if (!isThere) values.groups = ticked(fields)
+    if (fields.certificate.checked) values.certificate = true
     setBegun(await verb('enrol', values))
   }
   return html`
@@ -27,6 +29,9 @@ export function EnrolPhone({ users, groups, rights }) {
         spellcheck=${false} value=${name} onInput=${(event) => setName(event.currentTarget.value)} /></label>
       ${isThere ? html`<p>This user is there: it gets another password, and its other devices will have to know that.</p>`
     : html`<${Groups} all=${groups} of=${[]} />`}
+      <div class="ticks"><label><input type="checkbox" name="certificate" disabled=${Boolean(lackingSign)} /> With a certificate of
+        its own, for MQTT apps (a .p12 file)</label></div>
+      ${lackingSign && lackingSign !== '…' && html`<p class="quiet">A certificate needs <code>${lackingSign}</code></p>`}
       <label>This console, as the phone reaches it <input name="origin" type="url" required maxlength="300"
         defaultValue=${location.origin} /></label>
       ${LOOPBACK.test(location.origin) && html`<p>This page is open by a name that is the phone itself there:

@@ -19,8 +19,8 @@ export default function Enrol({ topic }) {
   useEffect(() => { history.replaceState(null, '', '#/enrol') }, [])
   const act = async (fields) => {
     const chosen = fields.password.value
-    const { user, mqtt_port: port } = await exchange(code, chosen)
-    setDone({ user, port, password: chosen })
+    const { user, mqtt_port: port, p12, problem } = await exchange(code, chosen)
+    setDone({ user, port, password: chosen, url: p12 && download(p12), problem })
     signIn(user, chosen).catch(() => {})
   }
   return html`<main class="sign-in"><h1>${location.hostname}</h1>
@@ -35,7 +35,7 @@ export default function Enrol({ topic }) {
   </main>`
 }
 
-function Done({ done: { user, port, password } }) {
+function Done({ done: { user, port, password, url, problem } }) {
   const { name, reason } = session.value
   return html`<p class="good" role="status">The password is set. Keep it: it is not shown again.</p>
     ${name === 'in' ? html`<p><a class="button" href="#/overview">To the console</a></p>`
@@ -46,7 +46,15 @@ function Done({ done: { user, port, password } }) {
       <div><dt>user</dt><dd><bdi>${shown(user, 2000)}</bdi></dd></div>
       <div><dt>password</dt><dd><code>${password}</code></dd></div>
       <div><dt>CA</dt><dd><a href="/ca.crt">ca.crt</a></dd></div>
-    </dl><p class="quiet">An app that wants a certificate of its own makes a request, which an admin signs.</p></section>`
+      ${url && html`<div><dt>certificate</dt><dd><a href=${url} download=${`${user}.p12`}><bdi>${shown(user)}</bdi>.p12</a>, which this
+        password opens; it is on no other device, and not shown again</dd></div>`}
+    </dl>${problem ? html`<p class="notice bad">There is no certificate: ${problem}</p>`
+    : !url && html`<p class="quiet">An app that wants a certificate of its own makes a request, which an admin signs.</p>`}</section>`
+}
+
+function download(base64) {
+  const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0))
+  return URL.createObjectURL(new Blob([bytes], { type: 'application/x-pkcs12' }))
 }
 
 function newPassword() {
