@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
+import signal
 import uuid
 from collections.abc import Generator, Iterator
+from contextlib import suppress
+from types import FrameType
+from typing import Any
 
 import pytest
 from appliance_process import ACL, ROBOT, ApplianceProcess
@@ -36,6 +41,33 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
     report = yield
     _fail_if_skipped(report)
     return report
+
+
+#: Seconds after which a timeout that came to nothing is tried again.
+AGAIN = 5.0
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_timeout_set_timer(settings: Any) -> Generator[None, object, object]:
+    """Let a timeout end a test on an event loop too, and ring until it has.
+
+    What its signal raises, uvloop and callbacks of asyncio log and forget; and `wait_for` loses a
+    cancellation now and then before Python 3.12.
+    """
+    done = yield
+    fail = signal.getsignal(signal.SIGALRM)
+    if not callable(fail):
+        return done
+
+    def end(number: int, frame: FrameType | None) -> None:
+        with suppress(RuntimeError):
+            for task in asyncio.all_tasks():
+                task.cancel("timeout of the test")
+        fail(number, frame)
+
+    signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, settings.timeout, AGAIN)
+    return done
 
 
 #: The files that take minutes. They go first, or the other workers end up waiting for the last.

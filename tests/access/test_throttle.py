@@ -247,17 +247,18 @@ async def test_now_and_then_one_that_comes_alone_is_hashed_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where other programs keep the processor busy, a sign-in would take a minute otherwise."""
-    pool: HashingPool[int] = HashingPool(2, 100)
+    pool: HashingPool[tuple[bool, int]] = HashingPool(2, 100)
     loop, clock = asyncio.get_running_loop(), Clock()
     monkeypatch.setattr(loop, "time", clock)
     normal = os.getpriority(os.PRIO_PROCESS, os.getpid())
+    low = min(19, normal + hashing_module.NICE)
 
-    def check() -> int:
+    def check() -> tuple[bool, int]:
         clock.now += 0.5
-        return _priority()
+        return threading.current_thread().name.startswith("prompt"), _priority()
 
-    assert await pool.run(b"", check) == normal
+    assert await pool.run(b"", check) == (True, normal)
     # One that comes by one now takes 5 % of the time at most from the others.
     found = [await pool.run(b"", check) for _ in range(30)]
-    assert [number for number, each in enumerate(found) if each == normal] == [19]
+    assert found == [(False, low)] * 19 + [(True, normal)] + [(False, low)] * 10
     pool.close()

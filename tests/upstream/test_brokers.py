@@ -290,14 +290,21 @@ async def test_mosquitto_twice_and_another_client_with_the_client_id(
             async with operator(first.plain_port, V5) as there:
                 await there.subscribe(states)
 
+                is_told = asyncio.Event()  # see `is_over` above
+
+                def is_online(times: int) -> bool:
+                    return came(there, states).count(b"online") >= times
+
                 async def take_over() -> None:
                     """As often as the link is online: all that it asked for is answered."""
                     for times in itertools.count(1):
-                        await until(lambda: came(there, states).count(b"online") >= times)  # noqa: B023
+                        await until(lambda: is_told.is_set() or is_online(times))  # noqa: B023
+                        if is_told.is_set():
+                            return
                         async with operator(first.plain_port, V5, "r2d2") as other:
-                            await other.closed.wait()
+                            await until(lambda: is_told.is_set() or other.closed.is_set())
 
                 taking = asyncio.ensure_future(take_over())
                 await until(lambda: "client id 'r2d2' as well?" in (rig.status().problem or ""))
-                taking.cancel()
-                await asyncio.wait({taking})
+                is_told.set()
+                await taking
