@@ -144,6 +144,74 @@ def test_keys_drive_while_they_are_held(visit: Callable[..., Visit], odometry: O
     odometry.stands()
 
 
+def test_a_phone_that_is_turned_or_interrupted(
+    visit: Callable[..., Visit], odometry: Odometry
+) -> None:
+    """The system takes the finger on the field away, or turns the page under it."""
+    page = visit(**PHONE).sign_in(page="Drive")
+    browser = page.context.new_cdp_session(page)
+    page.wait_for_selector(".pad[aria-disabled=false]")
+
+    def touch() -> None:
+        page.wait_for_selector("dd:text-is('ready')")
+        box = page.locator(".pad").bounding_box()
+        at = {"x": box["x"] + 0.5 * box["width"], "y": box["y"] + 0.02 * box["height"]}
+        browser.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
+        eventually(lambda: odometry.speed > SPEED, "the robot drives")
+        assert page.inner_text(".hint") == "Driving by touch"
+
+    touch()
+    browser.send("Input.dispatchTouchEvent", {"type": "touchCancel", "touchPoints": []})
+    odometry.stands()
+    touch()
+    size = page.viewport_size
+    metrics = {"deviceScaleFactor": 0, "mobile": True}
+    turned = {"type": "landscapePrimary", "angle": 90}
+    browser.send(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": size["height"], "height": size["width"], "screenOrientation": turned, **metrics},
+    )
+    odometry.stands()
+    assert page.inner_text(".hint") == "Hold to drive"
+
+
+#: A gamepad, as the browser would tell of it; there is none in CI.
+GAMEPAD = """() => {
+  const buttons = Array.from({length: 16}, () => ({pressed: false}))
+  globalThis.pad = {connected: true, axes: [0, 0], buttons}
+  navigator.getGamepads = () => [null, pad]
+}"""
+
+
+def test_a_gamepad_drives_while_its_button_is_held(
+    visit: Callable[..., Visit], odometry: Odometry
+) -> None:
+    page = visit(**DESKTOP).sign_in(page="Drive")
+    page.wait_for_selector("dd:text-is('ready')")
+    page.evaluate(GAMEPAD)
+    page.evaluate("pad.axes = [0, -1]")
+    before = odometry.count
+    eventually(lambda: odometry.count > before + 5, "odometry")
+    assert odometry.speed == 0  # the stick alone moves nothing
+    page.evaluate("pad.buttons[5].pressed = true")
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    assert page.inner_text(".hint") == "Driving by gamepad"
+    page.evaluate("pad.buttons[5].pressed = false")
+    odometry.stands()
+    page.wait_for_selector("dd:text-is('ready')")
+    page.evaluate("pad.buttons[4].pressed = true")
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    page.evaluate("pad.connected = false")  # its battery is empty, or its cable is out
+    odometry.stands()
+    page.evaluate("pad.connected = true")
+    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    page.evaluate("window.dispatchEvent(new Event('blur'))")
+    odometry.stands()
+    before = odometry.count
+    eventually(lambda: odometry.count > before + 5, "odometry")
+    assert odometry.speed == 0  # the button is held since before
+
+
 def test_a_browser_that_hangs(
     visit: Callable[..., Visit], browser: Any, odometry: Odometry, appliance: ApplianceProcess
 ) -> None:
