@@ -30,17 +30,20 @@ _ROUNDS: Final = 100_000
 
 
 def check_password(password: str) -> None:
-    """CertificateError when the password is too short for a file that is copied around."""
+    """CertificateError when the password is too short for a file that is copied around, or holds a
+    null character, at which OpenSSL takes it to end."""
     if len(password) < SHORTEST_PASSWORD:
         raise CertificateError(
             f"a password of less than {SHORTEST_PASSWORD} characters can be guessed"
         )
+    if "\0" in password:
+        raise CertificateError("a password with a null character opens no file")
 
 
 def write_pkcs12(directory: Path, name: str, password: str) -> Path:
     """Write `clients/NAME.p12`: key, certificate and `ca.crt` (RFC 7292). Returns its path.
 
-    CertificateError when one of them is missing or unfit, or the password too short.
+    CertificateError when one of them is missing or unfit, and as of `check_password`.
     """
     check_password(password)
     path, key = _key_of(directory, name)
@@ -56,7 +59,7 @@ def pkcs12(
 ) -> bytes:
     """What `write_pkcs12` writes, of a key that is in no file and of two certificates in PEM.
 
-    CertificateError when the password is too short.
+    CertificateError as of `check_password`.
     """
     check_password(password)
     own = parse_certificates(Path(f"{name}.crt"), certificate)[0]

@@ -208,6 +208,8 @@ async def test_a_certificate_for_the_phone(web: WebApp):
     code = await begin(web, "carol", groups=[], certificate=True)
     status, body = await use(web, code, "short")
     assert status == 400 and "8 characters" in body and not web.app._access.knows("carol")
+    status, body = await use(web, code, "null\0null\0null")
+    assert status == 400 and "null character" in body and not web.app._access.knows("carol")
     status, body = await use(web, code, "long enough")
     assert status == 200
     answer = json.loads(body)
