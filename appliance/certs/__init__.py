@@ -5,6 +5,7 @@ from __future__ import annotations
 from appliance.certs.addresses import Address, local_names
 from appliance.certs.authority import (
     check_client_name,
+    check_new_client,
     create_authority,
     issue_client,
     issue_server,
@@ -24,7 +25,7 @@ from appliance.certs.contexts import (
     load_tls,
     server_context,
 )
-from appliance.certs.export import check_password, pkcs12, write_bundle, write_pkcs12
+from appliance.certs.export import check_password, write_bundle, write_pkcs12
 from appliance.certs.files import CertificateError, issued_by, load_certificates, load_key
 from appliance.certs.identity import username_of
 from appliance.certs.listing import Expiry, ListedCertificate, expiries, list_certificates
@@ -45,6 +46,7 @@ __all__ = [
     "TlsFiles",
     "TlsPolicy",
     "check_client_name",
+    "check_new_client",
     "check_password",
     "create_authority",
     "expiries",
@@ -59,7 +61,6 @@ __all__ = [
     "load_tls",
     "local_names",
     "new_request",
-    "pkcs12",
     "renew",
     "revoke",
     "server_context",

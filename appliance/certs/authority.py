@@ -183,6 +183,21 @@ def sign(
     return path.with_name(f"{name}.crt")
 
 
+def check_new_client(directory: Path, name: str) -> None:
+    """CertificateError when a client of this name cannot get its first certificate here and now:
+    for its name, because it has one, or because the CA or its key cannot be used."""
+    check_client_name(name)
+    with _opened(directory, None) as authority:
+        authority.check_subject(name)
+        now = _now()
+        if any(
+            entry.name == name and entry.revoked is None and entry.expires > now
+            for entry in authority.entries
+        ):
+            raise CertificateError(f"{name!r} has a certificate, of another key: revoke that first")
+        authority.check_file(directory / "clients" / f"{name}.crt", None)
+
+
 def renew(directory: Path, name: str, ca_key: Path | None = None) -> None:
     """Renew `server.crt` or `clients/NAME.crt`, with the same key and names.
 
@@ -286,18 +301,9 @@ class _Authority:
         """Make `path`.crt for this public key, or for that of `path`.key, made if needed."""
         certificate_file = path.with_name(f"{path.name}.crt")
         key_file = path.with_name(f"{path.name}.key")
-        if certificate_file.exists():
-            before = load_certificates(certificate_file)[0]
-            if not issued_by(before, self.certificate):
-                raise CertificateError(
-                    f"{certificate_file} is not of this appliance's authority; move it away first"
-                )
-            self._check_same_key(certificate_file, before, key)
-        if kind == "client" and misleading(self.certificate, common_name):
-            raise CertificateError(
-                f"{common_name!r} looks like a DNS name, for which this authority may not sign; "
-                f"write {common_name.replace('.', '-')}"
-            )
+        self.check_file(certificate_file, key)
+        if kind == "client":
+            self.check_subject(common_name)
         new: ec.EllipticCurvePrivateKey | None = None
         if key is None:
             own = self._own_key(key_file)
@@ -318,14 +324,30 @@ class _Authority:
         self.save([*self.entries, entry])
         write_certificate(certificate_file, certificate)
 
-    def _check_same_key(
-        self, file: Path, before: x509.Certificate, key: CertificatePublicKeyTypes | None
-    ) -> None:
-        if key is None or key == before.public_key() or self.is_compromised(before.public_key()):
+    def check_subject(self, common_name: str) -> None:
+        """CertificateError when a client's certificate may not be made out to it."""
+        if misleading(self.certificate, common_name):
+            raise CertificateError(
+                f"{common_name!r} looks like a DNS name, for which this authority may not sign; "
+                f"write {common_name.replace('.', '-')}"
+            )
+
+    def check_file(self, file: Path, key: CertificatePublicKeyTypes | None) -> None:
+        """CertificateError when a certificate of this key may not take the place of what is there;
+        None for the key of that."""
+        if not file.exists():
             return
-        raise CertificateError(
-            f"{file} is of another key; revoke it first, or give this client another name"
-        )
+        before = load_certificates(file)[0]
+        if not issued_by(before, self.certificate):
+            raise CertificateError(
+                f"{file} is not of this appliance's authority; move it away first"
+            )
+        is_over = before.not_valid_after_utc < _now()
+        known = before.public_key()
+        if not (key is None or key == known or is_over or self.is_compromised(known)):
+            raise CertificateError(
+                f"{file} is of another key; revoke it first, or give this client another name"
+            )
 
     def _own_key(self, file: Path) -> ec.EllipticCurvePrivateKey | None:
         """The key of that file; None when a new one is needed."""
@@ -454,7 +476,8 @@ def _opened(directory: Path, ca_key: Path | None) -> Iterator[_Authority]:
     problem = out_of_time(certificate_file, certificate, _now())
     if problem:
         raise CertificateError(problem)
-    with locked(directory):
+    # Whoever may read the directory could lock that, for as long as they like; not so the key.
+    with locked(directory if ca_key is not None else key_file):
         yield _Authority(directory, certificate, key, _entries(directory, certificate))
 
 

@@ -125,6 +125,11 @@ class LoadedTls:
         issuers = [each for each in known if each == top or issued_by(top, each)]
         return b"".join(each.public_bytes(Encoding.PEM) for each in issuers)
 
+    @property
+    def trust(self) -> object:
+        """Which clients' certificates are taken: whose, and without which. To be compared."""
+        return self.authorities, self.revocations.dates
+
     def plausible(self, now: datetime) -> datetime:
         """The clock's time, or the earliest that it can be: this program was released and the
         server's certificate was made before."""
@@ -282,6 +287,11 @@ class TlsContexts:
     def warnings(self, now: datetime | None = None) -> list[str]:
         """What has expired or will soon, each with what to do."""
         return self._loaded.warnings(now)
+
+    @property
+    def trust(self) -> object:
+        """See `LoadedTls.trust`."""
+        return self._loaded.trust
 
     @property
     def files(self) -> TlsFiles:

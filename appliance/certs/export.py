@@ -24,6 +24,7 @@ from appliance.certs.files import (
     parse_certificates,
     write,
 )
+from appliance.certs.pkcs12_mac import with_rounds
 
 SHORTEST_PASSWORD: Final = 8
 _ROUNDS: Final = 100_000
@@ -75,7 +76,8 @@ def _packed(
     password: str,
 ) -> bytes:
     # Not AES, which iOS before 16, Android before 13 and Windows 10 refuse as a wrong password. The
-    # number of rounds and the password's length make up for it.
+    # number of rounds and the password's length make up for it: also of the MAC, which the library
+    # makes with few.
     encryption = (
         PrivateFormat.PKCS12.encryption_builder()
         .kdf_rounds(_ROUNDS)
@@ -83,7 +85,10 @@ def _packed(
         .hmac_hash(hashes.SHA1())
         .build(password.encode())
     )
-    return serialize_key_and_certificates(name.encode(), key, certificate, authorities, encryption)
+    packed = serialize_key_and_certificates(
+        name.encode(), key, certificate, authorities, encryption
+    )
+    return with_rounds(packed, password, _ROUNDS)
 
 
 def write_bundle(directory: Path, name: str) -> Path:

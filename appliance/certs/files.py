@@ -210,12 +210,12 @@ def _sync_directory(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Lock the directory against other commands, and the appliance itself, that change it."""
+def locked(path: Path) -> Iterator[None]:
+    """Lock out other commands, and the appliance itself, that lock this file or directory."""
     try:
-        descriptor = os.open(directory, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY)
     except OSError as error:
-        raise unreadable(directory, error) from error
+        raise unreadable(path, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
+from cryptography.hazmat.primitives.serialization import Encoding
 from pydantic import Field
 
 from appliance import certs
@@ -88,8 +89,8 @@ class CertificateVerbs:
             made = certs.sign(directory, wanted.request.encode(), wanted.name)
             return {
                 "name": made.stem,
-                "certificate": made.read_text(encoding="ascii"),
-                "ca": (directory / "ca.crt").read_text(encoding="ascii"),
+                "certificate": _pem(made),
+                "ca": _pem(directory / "ca.crt"),
             }
 
         async with self._lock:
@@ -128,7 +129,15 @@ class CertificateVerbs:
         except CertificateError as error:
             raise CallError("rejected", str(error)) from None
         except OSError as error:
-            raise CallError("failed", f"{error.filename}: {error.strerror}") from None
+            where = "" if error.filename is None else f"{error.filename}: "
+            raise CallError("failed", f"{where}{error.strerror}") from None
+
+
+def _pem(file: Path) -> str:
+    """Its certificates, without what people write between them."""
+    return b"".join(
+        each.public_bytes(Encoding.PEM) for each in certs.load_certificates(file)
+    ).decode()
 
 
 def _of_name(wanted: SignRequest) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import fcntl
 import ipaddress
 import os
 import re
@@ -640,3 +641,27 @@ def test_a_server_that_was_revoked_is_renewed_with_a_new_key(own: Path) -> None:
     certs.renew(own, "server")
     assert (own / "server.key").read_bytes() != before
     assert certs.server_revoked(files) == ""
+
+
+def test_a_certificate_that_is_over_makes_room(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The key of the one before is of no use to anybody."""
+    _, first = certs.new_request("phone")
+    _, second = certs.new_request("phone")
+    certs.sign(own, first, "phone")
+    with pytest.raises(CertificateError, match="has a certificate, of another key"):
+        certs.check_new_client(own, "phone")
+    with pytest.raises(CertificateError, match="is of another key; revoke it first"):
+        certs.sign(own, second, "phone")
+    later = authority._now() + authority.CERTIFICATE_VALID
+    monkeypatch.setattr(authority, "_now", lambda: later)
+    certs.check_new_client(own, "phone")
+    certs.sign(own, second, "phone")
+
+
+def test_who_may_only_read_the_directory_does_not_hold_it_up(own: Path) -> None:
+    descriptor = os.open(own, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        certs.issue_client(own, "phone")
+    finally:
+        os.close(descriptor)
