@@ -3,7 +3,8 @@
 Whoever manages users begins one and shows the code, as a QR code, to the person whose phone it is.
 That person chooses the password, which so nobody else learns. A code has no right of its own: it
 does what the one who has begun it may do when it is used. As a token it ends with another password
-or the removal of its user, and of the one who has begun it. Codes are in memory only, as HMACs
+or the removal of its user, and of the one who has begun it; and with the revocation of any
+certificate, as who has begun it may have logged in by that one. Codes are in memory only, as HMACs
 under a key of this process, so that neither the memory nor the time of a look-up tells one.
 """
 
@@ -21,8 +22,9 @@ from appliance.broker.values import Identity
 #: Seconds for which a code can be used.
 LIFETIME: Final = 600.0
 
-#: The most codes of all users; each user has one at most.
+#: The most codes of all users, of whom each has one at most; and the most that one has begun.
 MOST: Final = 64
+MOST_OF_MAKER: Final = 16
 
 #: Random bytes of a code.
 _RANDOM: Final = 24
@@ -66,14 +68,15 @@ class Enrolments:
         by: Identity | None,
         with_certificate: bool = False,
     ) -> str | None:
-        """A new code in the place of an earlier one of this user; None when there are too many."""
+        """A new code in the place of an earlier one of this user; None when there are too many, of
+        all or of those that `by` has begun."""
         now = self._clock()
         self._pending = {
             key: each
             for key, each in self._pending.items()
             if each.ends_at > now and each.username != username
         }
-        if len(self._pending) >= MOST:
+        if len(self._pending) >= MOST or (by is not None and self._begun(by) >= MOST_OF_MAKER):
             return None
         code = secrets.token_urlsafe(_RANDOM)
         stored = self._stored(username, groups, by)
@@ -94,6 +97,16 @@ class Enrolments:
         """Let the code be used, as nothing came of it; unless there is a later one of this user."""
         if all(each.username != enrolment.username for each in self._pending.values()):
             self._pending[self._digest(code)] = enrolment
+
+    def end_others(self) -> None:
+        """End all codes but those that were begun on this computer: certificates were revoked."""
+        self._pending = {key: each for key, each in self._pending.items() if each.by is None}
+
+    def _begun(self, by: Identity) -> int:
+        return sum(
+            each.by is not None and each.by.username == by.username
+            for each in self._pending.values()
+        )
 
     def _digest(self, code: str) -> bytes:
         return hmac.digest(self._key, code.encode(), "sha256")

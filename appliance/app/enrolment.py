@@ -18,7 +18,8 @@ from appliance.access import FileAccess
 from appliance.access.enrolments import Enrolments
 from appliance.broker.broker import Broker
 from appliance.broker.values import Refusal
-from appliance.management.enrolment import carry_out
+from appliance.management.enrolment import LONGEST_ENROLMENT, carry_out
+from appliance.management.phone_certificates import PhoneCertificates
 from appliance.management.verbs import Verbs
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.http import HttpRequest, HttpResponse, text
@@ -46,6 +47,7 @@ class EnrolmentParts:
     access: FileAccess
     login: WebLogin
     enrolments: Enrolments
+    phones: PhoneCertificates
     verbs: Callable[[], Verbs | None]
     mqtt_port: Callable[[], int | None]
 
@@ -74,8 +76,11 @@ def enrol(parts: EnrolmentParts) -> Resource:
             throttle.record_failure(request.address, "")
             parts.login.note(request, None, _UNKNOWN)
             return text(403, "this code was used, has ended, or is not of here")
+        request.allow(LONGEST_ENROLMENT)
         try:
-            done = await carry_out(parts.broker, verbs, enrolment, password, request.address)
+            done = await carry_out(
+                parts.broker, verbs, parts.phones, enrolment, password, request.address
+            )
         except CallError as error:
             if error.code == "bad_request":  # the password: another one may be better
                 parts.enrolments.put_back(code, enrolment)

@@ -44,6 +44,7 @@ from appliance.config.plugins import PluginSettingsError
 from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
 from appliance.management.mqtt_calls import ManagementCalls
+from appliance.management.phone_certificates import PhoneCertificates
 from appliance.management.verbs import Verbs
 from appliance.net.callbacks import Entries, contained_proxy
 from appliance.net.listeners import Admission, Listeners
@@ -200,6 +201,7 @@ class App:
         self._tls, self._store = tls, store
         self._login, self._access = login, access
         self._enrolments = Enrolments(lambda user: access.in_force.passwords.hash_of(user))
+        self._phones = PhoneCertificates(lambda: self._reload.settings.broker)
         self._start_clock(loop)
         # Before the listeners start, and stopped after them: whatever a client is acknowledged is
         # offered to the links.
@@ -213,7 +215,15 @@ class App:
         self._start_bridge(loop)
         self._reload = Reload(
             ReloadParts(
-                settings, access, tls, broker, listeners, self.bridge, self.audit, self._links
+                settings,
+                access,
+                tls,
+                broker,
+                listeners,
+                self.bridge,
+                self.audit,
+                self._links,
+                self._enrolments,
             )
         )
         self._status = status.Status(
@@ -322,6 +332,7 @@ class App:
                 self._listeners,
                 self._access,
                 self._enrolments,
+                self._phones,
                 lambda: self._verbs,
             )
         )
@@ -371,6 +382,7 @@ class App:
                 self._entries,
                 self._access,
                 self._enrolments,
+                self._phones,
                 self.bridge,
                 self.upstreams,
                 self._status,

@@ -17,6 +17,7 @@ from appliance.management.certificates import CertificateVerbs
 from appliance.management.clients import ClientVerbs
 from appliance.management.enrolment import EnrolmentVerb
 from appliance.management.examination import DoctorVerb
+from appliance.management.phone_certificates import PhoneCertificates
 from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
 from appliance.management.tokens import TokenVerbs
@@ -44,6 +45,7 @@ class ManagementParts:
     entries: Entries
     access: FileAccess
     enrolments: Enrolments
+    phones: PhoneCertificates
     bridge: Bridge | None
     upstreams: Sequence[Uplink]
     status: Status
@@ -71,7 +73,7 @@ def verbs(parts: ManagementParts) -> Verbs:
         *RightsVerbs(parts.broker, parts.access).verbs(),
         *UserVerbs(parts.access, take_over).verbs(),
         *TokenVerbs(parts.broker, parts.access).verbs(),
-        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, directory).verbs(),
+        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, parts.phones).verbs(),
         *CertificateVerbs(directory, take_over).verbs(),
         # Its path changes with a restart only.
         *RecordVerbs(reload.settings.broker.audit.path).verbs(),

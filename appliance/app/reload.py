@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from appliance import config
 from appliance.access import AccessFileError, Changes, FileAccess, Rules
+from appliance.access.enrolments import Enrolments
 from appliance.app import wiring
 from appliance.app.links import Links
 from appliance.broker.broker import Broker
@@ -69,6 +70,7 @@ class ReloadParts:
     bridge: Bridge | None
     audit: Audit | None
     links: Links
+    enrolments: Enrolments
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +195,11 @@ class Reload:
 
     def _take_certificates(self, tls: TlsContexts, loaded: LoadedTls) -> list[str]:
         """Use them for new connections, and check those of connected clients against them."""
+        before = tls.trust
         if not tls.take(loaded):
             return []
+        if before != loaded.trust:
+            self._parts.enrolments.end_others()
         listeners = self._parts.listeners
         listeners.scheduler.in_background(listeners.check_certificates())
         return ["certificates"]

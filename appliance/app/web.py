@@ -12,6 +12,7 @@ from appliance.access.enrolments import Enrolments
 from appliance.app.enrolment import EnrolmentParts, enrol
 from appliance.app.metrics import Metrics, MetricsParts
 from appliance.certs import TlsContexts
+from appliance.management.phone_certificates import PhoneCertificates
 from appliance.management.topics import topic_of
 from appliance.management.verbs import Verbs
 from appliance.net.listeners import Listeners
@@ -40,6 +41,7 @@ class WebParts(MetricsParts):
     listeners: Listeners
     access: FileAccess
     enrolments: Enrolments
+    phones: PhoneCertificates
     verbs: Callable[[], Verbs | None]
 
 
@@ -61,6 +63,7 @@ def site(parts: WebParts) -> WebSite:
                     parts.access,
                     login,
                     parts.enrolments,
+                    parts.phones,
                     parts.verbs,
                     lambda: _mqtts_port(parts.listeners),
                 )

@@ -1,17 +1,16 @@
 """The verb `enrol`: a one-time code with which a phone sets its user's password.
 
 A code is worth the right to add that user, or to change its password, and is given to nobody
-without that right. When it is used, the same is asked again. With a certificate, the phone gets a
-PKCS #12 file for its MQTT apps, under the password that it has chosen. The key is made then, and
-kept nowhere: phones import such files, and make no requests.
+without that right. When it is used, the same is asked again, and whether it could still be begun.
+With a certificate, the phone gets a file for its MQTT apps as well, under the password that it has
+chosen.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Final
 from urllib.parse import quote
 
@@ -24,6 +23,8 @@ from appliance.access.enrolments import LIFETIME, Enrolment, Enrolments
 from appliance.broker.broker import Broker
 from appliance.broker.values import Identity
 from appliance.certs import CertificateError
+from appliance.management.certificates import TIMEOUT
+from appliance.management.phone_certificates import PACKING, SIGN, PhoneCertificates
 from appliance.management.topics import topic_of
 from appliance.management.users import GroupNames, UserName
 from appliance.management.verbs import Arguments, Caller, Verb, Verbs
@@ -32,8 +33,11 @@ from appliance.ros.calls.dispatcher import CallError
 #: The most characters of a user's name that the URL says as well, for who looks at it.
 _SHOWN: Final = 60
 
-#: The verb that makes the certificate.
-_SIGN: Final = "certificate_sign"
+#: The verb that begins an enrolment.
+_BEGIN: Final = "enrol"
+
+#: Seconds that the use of a code takes at most: two changes with their reloads, and the file.
+LONGEST_ENROLMENT: Final = 2 * TIMEOUT + PACKING
 
 #: Scheme, host and port of the console, as the phone reaches it.
 Origin = Annotated[str, Field(max_length=300, pattern=r"^https?://[A-Za-z0-9.:\[\]_-]+$")]
@@ -66,17 +70,16 @@ class EnrolmentVerb:
         broker: Broker,
         access: FileAccess,
         enrolments: Enrolments,
-        directory: Callable[[], Path | None],
+        phones: PhoneCertificates,
     ) -> None:
-        """`directory` is that of the CA, None where it is another's."""
         self._broker = broker
         self._access = access
         self._enrolments = enrolments
-        self._directory = directory
+        self._phones = phones
 
     def verbs(self) -> Iterator[Verb[Any]]:
         """The verb."""
-        yield Verb("enrol", Enrol, self._begin, changes="enrolment begun", changed=_named)
+        yield Verb(_BEGIN, Enrol, self._begin, changes="enrolment begun", changed=_named)
 
     async def _begin(self, caller: Caller, wanted: Enrol) -> dict[str, Any]:
         groups = None if wanted.groups is None else tuple(wanted.groups)
@@ -91,8 +94,8 @@ class EnrolmentVerb:
         if groups is not None:
             await self._check_new(wanted.user, groups)
         if wanted.certificate:
-            check_right(self._broker, caller.identity, _SIGN)
-            await self._check_certificate(wanted.user)
+            check_right(self._broker, caller.identity, SIGN)
+            await self._phones.check(wanted.user)
         code = self._enrolments.begin(wanted.user, groups, caller.identity, wanted.certificate)
         if code is None:
             raise CallError("too_many", "too many enrolments wait for their phones")
@@ -112,31 +115,19 @@ class EnrolmentVerb:
         except ValueError as error:
             raise CallError("bad_request", str(error)) from None
 
-    async def _check_certificate(self, user: str) -> None:
-        """As `_check_new`."""
-        directory = self._directory()
-        if directory is None:
-            raise CallError("rejected", "the certificates are not of this appliance's own CA")
-        try:
-            certs.check_client_name(user)
-            listed = await asyncio.to_thread(lambda: certs.list_certificates(directory))
-        except CertificateError as error:
-            raise CallError("rejected", str(error)) from None
-        if any(each.name == user and each.state == "valid" for each in listed):
-            raise CallError(
-                "rejected",
-                f"{user!r} has a certificate, of another key: revoke that first, or enrol this "
-                "device without one",
-            )
-
 
 async def carry_out(
-    broker: Broker, verbs: Verbs, enrolment: Enrolment, password: str, address: str
+    broker: Broker,
+    verbs: Verbs,
+    phones: PhoneCertificates,
+    enrolment: Enrolment,
+    password: str,
+    address: str,
 ) -> Enrolled:
     """Set the password, as the one who has begun the enrolment; from the phone's address.
 
-    Raises CallError, and then nothing has changed. A certificate that is refused is none of that:
-    the password is set by then.
+    Raises CallError, and then nothing has changed, or the change is not in force, as that says. A
+    certificate that is refused is none of that: the password is set by then.
     """
     if enrolment.with_certificate:
         try:
@@ -144,7 +135,8 @@ async def carry_out(
         except CertificateError as error:
             raise CallError("bad_request", str(error)) from None
     verb = _verb_for(enrolment.groups)
-    check_right(broker, enrolment.by, verb)
+    for needed in (_BEGIN, verb):
+        check_right(broker, enrolment.by, needed)
     values: dict[str, Any] = {"user": enrolment.username, "password": password}
     if enrolment.groups is not None:
         values["groups"] = list(enrolment.groups)
@@ -153,19 +145,10 @@ async def carry_out(
     if not enrolment.with_certificate:
         return Enrolled()
     try:
-        check_right(broker, enrolment.by, _SIGN)
-        return Enrolled(await _certified(verbs, caller, enrolment.username, password))
-    except (CallError, CertificateError) as error:
+        check_right(broker, enrolment.by, SIGN)
+        return Enrolled(await phones.make(verbs, caller, enrolment.username, password))
+    except CallError as error:
         return Enrolled(problem=str(error))
-
-
-async def _certified(verbs: Verbs, caller: Caller, name: str, password: str) -> bytes:
-    """Key and certificate, as PKCS #12."""
-    key, request = certs.new_request(name)
-    made: Any = await verbs.run(caller, _SIGN, {"request": request.decode(), "name": name})
-    certificate, authority = made["certificate"].encode(), made["ca"].encode()
-    # A fifth of a second, for which the lock of the interpreter is given up.
-    return await asyncio.to_thread(certs.pkcs12, name, key, certificate, authority, password)
 
 
 def check_right(broker: Broker, identity: Identity | None, verb: str) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import os
-import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from appliance.management.child import Child
 from appliance.management.verbs import Arguments, Caller, Verb
 from appliance.ros.calls.dispatcher import CallError
 
@@ -44,50 +42,8 @@ class DoctorVerb:
         if self._lock.locked():
             raise CallError("too_many", "an examination is under way")
         async with self._lock:
-            process = _Process(self._command)
-            try:
-                output = await asyncio.to_thread(process.run)
-            except asyncio.CancelledError:  # it takes too long, or the appliance stops
-                process.kill()
-                raise
+            output = await Child(self._command, LONGEST, _NICE).output()
         return {"findings": _findings(output)}
-
-
-class _Process:
-    """A process whose output is read in a thread."""
-
-    def __init__(self, command: Sequence[str]) -> None:
-        self._command = command
-        self._process: subprocess.Popen[bytes] | None = None
-        self._is_ended = False
-
-    def run(self) -> bytes:
-        """What it prints, a byte more than LONGEST at most. Raises CallError."""
-        try:
-            self._process = subprocess.Popen(
-                self._command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-            )
-        except OSError as error:
-            raise CallError("failed", f"no process can be started: {error.strerror}") from None
-        with self._process as process:
-            if self._is_ended:
-                process.kill()
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, process.pid, _NICE)
-            assert process.stdout is not None
-            output = process.stdout.read(LONGEST + 1)
-            if len(output) > LONGEST:
-                process.kill()
-        return output
-
-    def kill(self) -> None:
-        """End it; from the event loop's thread."""
-        self._is_ended = True
-        if self._process is not None:
-            self._process.kill()
 
 
 def _findings(output: bytes) -> list[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from appliance.access.enrolments import LIFETIME, MOST, Enrolments
+from appliance.access.enrolments import LIFETIME, MOST, MOST_OF_MAKER, Enrolments
 from appliance.broker.values import Identity
 
 ADMIN = Identity("admin", "a")
@@ -48,6 +48,23 @@ def test_codes_are_bounded():
     clock.now += LIFETIME
     assert enrolments.begin("one more", None, None) is not None
     assert len(enrolments._pending) == 1
+
+
+def test_nobody_takes_all_the_places():
+    enrolments = Enrolments({}.get, Clock())
+    begun = [enrolments.begin(str(number), None, ADMIN) for number in range(MOST_OF_MAKER + 1)]
+    assert all(begun[:-1]) and begun[-1] is None
+    assert enrolments.begin("0", None, ADMIN)  # in the place of the earlier one
+    assert enrolments.begin("more", None, Identity("helper", "a"))
+    assert enrolments.begin("and more", None, None)
+
+
+def test_only_codes_of_this_computer_outlive_a_revocation():
+    enrolments = Enrolments({}.get, Clock())
+    from_afar, here = (enrolments.begin(name, None, by) for name, by in (("a", ADMIN), ("b", None)))
+    enrolments.end_others()
+    assert from_afar and enrolments.take(from_afar) is None
+    assert here and enrolments.take(here) is not None
 
 
 def test_another_password_or_a_removal_ends_a_code():

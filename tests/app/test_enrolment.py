@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from both_loops import event_loop_policy as event_loop_policy
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import pkcs12
@@ -18,8 +19,9 @@ from web_app import WebApp
 
 from appliance import certs
 from appliance.access import Passwords
-from appliance.app import enrolment, management
+from appliance.app import enrolment
 from appliance.broker.values import Identity
+from appliance.management import phone_certificates
 from appliance.management.verbs import LOCAL, Caller
 from appliance.net.http import HttpRequest
 from appliance.ros.calls.dispatcher import CallError
@@ -263,6 +265,91 @@ async def test_names_that_no_certificate_can_have(web: WebApp):
 
 
 async def test_the_certificates_of_another_authority(web: WebApp, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(management, "authority_directory", lambda settings: None)
+    monkeypatch.setattr(phone_certificates, "authority_directory", lambda settings: None)
     with pytest.raises(CallError, match="not of this appliance's own CA"):
         await begin(web, "carol", groups=[], certificate=True)
+
+
+async def take_users_from(web: WebApp, source: str) -> None:
+    """Have clients' certificates say who they are."""
+    settings = yaml.safe_load(web.file.read_text())
+    settings["broker"]["tls"]["username_from"] = source
+    settings["broker"]["listeners"][1]["client_certificates"] = "optional"
+    web.file.write_text(yaml.safe_dump(settings))
+    await web.app.reload()
+
+
+async def test_certificates_that_would_name_no_user(web: WebApp):
+    await take_users_from(web, "san")
+    with pytest.raises(CallError, match="username_from: san"):
+        await begin(web, "carol", groups=[], certificate=True)
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+async def test_what_becomes_of_a_code_whose_certificate_cannot_be_made(web: WebApp, is_new: bool):
+    """It is found before there is a code, or told to the phone without this computer's paths."""
+    directory = web.directory / "certs"
+    hidden = directory / "hidden.key"
+    (directory / "ca.key").rename(hidden)
+    with pytest.raises(CallError, match=r"^rejected: there is no ca\.key|there is no ca\.key"):
+        await begin(web, "carol", groups=[], certificate=True)
+    hidden.rename(directory / "ca.key")
+    code = await begin(web, "carol", groups=[], certificate=True)
+    if is_new:
+        (directory / "ca.key").rename(hidden)
+    else:
+        certs.issue_client(directory, "carol")
+    status, body = await use(web, code, "long enough")
+    answer = json.loads(body)
+    wanted = "there is no ca.key" if is_new else "has a certificate, of another key"
+    assert status == 200 and answer["p12"] is None and wanted in answer["problem"]
+    assert str(directory) not in body
+
+
+async def test_a_name_like_a_host_s(web: WebApp):
+    with pytest.raises(CallError, match="looks like a DNS name"):
+        await begin(web, "john.smith", groups=[], certificate=True)
+
+
+async def test_a_ca_with_words_beside_it(web: WebApp):
+    file = web.directory / "certs/ca.crt"
+    file.write_text(f"# die Behörde, 認証局\n{file.read_text()}")
+    code = await begin(web, "carol", groups=[], certificate=True)
+    answer = json.loads((await use(web, code, "long enough"))[1])
+    assert answer["problem"] == "" and answer["p12"]
+
+
+async def test_a_revocation_ends_the_codes_of_others(web: WebApp):
+    """Whoever has begun an enrolment may have logged in with that certificate."""
+    await take_users_from(web, "subject")
+    certs.issue_client(web.directory / "certs", "lost")
+    from_afar = await begin(web, "carol", groups=[])
+    here = await begin(web, "dave", LOCAL, groups=[])
+    await call(web, "certificate_revoke", certificate="lost")
+    assert (await use(web, from_afar))[0] == 403 and not web.app._access.knows("carol")
+    assert (await use(web, here))[0] == 200
+
+
+async def test_the_right_to_enrol_is_asked_again(web: WebApp):
+    code = await begin(web, "carol", HELPER, groups=[])
+    rules = web.directory / "acl.conf"
+    rules.write_text(RULES.replace("topic write $CONTROL/appliance/v1/enrol/_call\n", ""))
+    await web.app.reload()
+    status, body = await use(web, code)
+    assert status == 403 and "right to enrol" in body and not web.app._access.knows("carol")
+
+
+async def test_the_file_is_made_elsewhere(web: WebApp, monkeypatch: pytest.MonkeyPatch):
+    """It holds the interpreter's lock for long; a program that fails leaves the reason."""
+
+    def held(*_: object) -> bytes:
+        raise AssertionError("in the appliance itself")
+
+    monkeypatch.setattr(certs.export, "serialize_key_and_certificates", held)
+    code = await begin(web, "carol", groups=[], certificate=True)
+    answer = json.loads((await use(web, code, "long enough"))[1])
+    assert answer["problem"] == "" and answer["p12"]
+    monkeypatch.setattr(certs.packing, "COMMAND", ("false",))
+    code = await begin(web, "dave", groups=[], certificate=True)
+    answer = json.loads((await use(web, code, "long enough"))[1])
+    assert answer["p12"] is None and "revoke its certificate" in answer["problem"]

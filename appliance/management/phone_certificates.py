@@ -1,0 +1,81 @@
+"""A phone's first key and certificate, as a PKCS #12 file: phones import such files, and make no
+requests. The key is in no file of this computer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from appliance import certs
+from appliance.certs import CertificateError, packing
+from appliance.certs.settings import authority_directory
+from appliance.config import BrokerSection
+from appliance.management.child import Child
+from appliance.management.verbs import Caller, Verbs
+from appliance.ros.calls.dispatcher import CallError
+
+#: The verb that makes the certificate.
+SIGN: Final = "certificate_sign"
+
+#: Seconds for the file: it takes half a second, and waits for those before it.
+PACKING: Final = 60.0
+
+#: The priority of the program that makes it, see nice(2).
+_NICE: Final = 5
+
+
+class PhoneCertificates:
+    """Makes them, one at a time. What is wrong is told to phones: without this computer's paths."""
+
+    def __init__(self, broker: Callable[[], BrokerSection]) -> None:
+        """`broker` is the section of the configuration that is in force."""
+        self._broker = broker
+        self._lock = asyncio.Lock()
+
+    async def check(self, name: str) -> None:
+        """Raise CallError where `make` would be refused: a phone's owner could not mend that."""
+        directory = self._directory()
+        try:
+            await asyncio.to_thread(certs.check_new_client, directory, name)
+        except CertificateError as error:
+            raise CallError("rejected", _without(directory, str(error))) from None
+
+    async def make(self, verbs: Verbs, caller: Caller, name: str, password: str) -> bytes:
+        """The file of a new key, which the password opens. Raises CallError."""
+        await self.check(name)
+        key, request = certs.new_request(name)
+        try:
+            made: Any = await verbs.run(caller, SIGN, {"request": request.decode(), "name": name})
+            given = packing.given(name, key, made["certificate"], made["ca"], password)
+            packed = await asyncio.wait_for(self._packed(given), PACKING)
+        except CallError as error:
+            raise CallError(error.code, _without(self._directory(), str(error))) from None
+        except asyncio.TimeoutError:
+            packed = b""
+        if not packed:
+            raise CallError("failed", "the .p12 could not be made; revoke its certificate")
+        return packed
+
+    async def _packed(self, given: bytes) -> bytes:
+        async with self._lock:
+            return await Child(packing.COMMAND, packing.LONGEST, _NICE).output(given)
+
+    def _directory(self) -> Path:
+        broker = self._broker()
+        directory = authority_directory(broker)
+        if directory is None:
+            raise CallError("rejected", "the certificates are not of this appliance's own CA")
+        if broker.tls.username_from == "san":
+            raise CallError(
+                "rejected",
+                "here a certificate's alternative name says who logs in (username_from: san), and "
+                "those made for phones have none",
+            )
+        return directory
+
+
+def _without(directory: Path, text: str) -> str:
+    return text.replace(f"{directory}/", "")
