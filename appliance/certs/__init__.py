@@ -26,7 +26,13 @@ from appliance.certs.contexts import (
     server_context,
 )
 from appliance.certs.export import check_password, write_bundle, write_pkcs12
-from appliance.certs.files import CertificateError, issued_by, load_certificates, load_key
+from appliance.certs.files import (
+    CertificateError,
+    certificate_fingerprint,
+    issued_by,
+    load_certificates,
+    load_key,
+)
 from appliance.certs.identity import username_of
 from appliance.certs.listing import Expiry, ListedCertificate, expiries, list_certificates
 from appliance.certs.registry import Issued
@@ -45,6 +51,7 @@ __all__ = [
     "TlsContexts",
     "TlsFiles",
     "TlsPolicy",
+    "certificate_fingerprint",
     "check_client_name",
     "check_new_client",
     "check_password",

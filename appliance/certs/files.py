@@ -13,6 +13,7 @@ from typing import Final
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import (
@@ -98,6 +99,11 @@ def parse_certificates(path: Path, data: bytes) -> list[x509.Certificate]:
     except MALFORMED:
         raise CertificateError(f"{path} is not a certificate in PEM form") from None
     return certificates
+
+
+def certificate_fingerprint(path: Path) -> str:
+    """SHA-256 of the first certificate of a file, as browsers and OpenSSL write it."""
+    return load_certificates(path)[0].fingerprint(hashes.SHA256()).hex(":").upper()
 
 
 def load_key(path: Path) -> PrivateKeyTypes:

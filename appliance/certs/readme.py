@@ -43,7 +43,8 @@ it is valid, `appliance cert renew NAME` renews a client's.
 
 ## Giving `ca.crt` to clients
 
-Compare the fingerprints on both sides: `openssl x509 -in ca.crt -noout -fingerprint -sha256`.
+Compare the fingerprints on both sides: `appliance cert fingerprint` here, and there
+`openssl x509 -in ca.crt -noout -fingerprint -sha256`.
 
 - **mosquitto_sub, mosquitto_pub**: `--cafile ca.crt`. **paho-mqtt**: `client.tls_set("ca.crt")`.
   **MQTT.js**: `ca: fs.readFileSync("ca.crt")`.

@@ -188,6 +188,30 @@ def cert_list(
         typer.echo(f"  {entry.expires:%Y-%m-%d}  {entry.serial_text}")
 
 
+@cert_app.command("fingerprint")
+def cert_fingerprint(
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a line of JSON per certificate.")
+    ] = False,
+    config: ConfigOption = None,
+) -> None:
+    """SHA-256 of the server's certificate and of the CA's, to compare with what devices show."""
+    settings = load(config)
+    from appliance import certs
+
+    tls = settings.broker.tls
+    try:
+        found = {file: certs.certificate_fingerprint(file) for file in (tls.certificate, tls.ca)}
+    except certs.CertificateError as error:
+        raise CommandError(str(error)) from None
+    width = max(len(file.name) for file in found)
+    for file, text in found.items():
+        if as_json:
+            typer.echo(json.dumps({"file": str(file), "sha256": text}))
+        else:
+            typer.echo(f"{file.name:{width}}  {text}")
+
+
 @cert_app.command("crl")
 def cert_crl(ca_key: CaKeyOption = None, config: ConfigOption = None) -> None:
     """Renew ca.crl, the revocation list, for programs that require a recent one."""

@@ -355,6 +355,22 @@ def test_the_list(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
 # What can be wrong
 
 
+@needs_openssl
+def test_fingerprints_are_those_that_devices_show(here: Path, capsys) -> None:
+    assert run("cert", "fingerprint") == 0
+    printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    assert printed.keys() == {"server.crt", "ca.crt"}
+    for name, text in printed.items():
+        said = openssl("x509", "-in", here / name, "-noout", "-fingerprint", "-sha256")
+        assert said.splitlines()[0].endswith(f"Fingerprint={text}")
+    assert run("cert", "fingerprint", "--json") == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {Path(line["file"]).name: line["sha256"] for line in lines} == printed
+    (here / "ca.crt").write_text("nothing")
+    assert run("cert", "fingerprint") == 1
+    assert "ca.crt" in capsys.readouterr().err
+
+
 def test_the_authoritys_key_is_kept_elsewhere(here: Path, tmp_path: Path, capsys) -> None:
     stick = tmp_path / "stick.key"
     (here / "ca.key").rename(stick)
