@@ -22,6 +22,7 @@ from appliance.cli.doctor import doctor
 from appliance.cli.enrol import user_enrol
 from appliance.cli.fastdds import fastdds
 from appliance.cli.install import install, uninstall
+from appliance.cli.log import log
 from appliance.cli.routes import routes
 from appliance.cli.running import bench, check, demo, init, reload, run
 from appliance.cli.status import status
@@ -37,7 +38,7 @@ app = typer.Typer(
 )
 # In this order in the help.
 SETTING_UP = (init, run, check, reload)
-LOOKING = (status, top, doctor, routes, upstream)
+LOOKING = (status, top, doctor, log, routes, upstream)
 USING = (pub, sub, call, goal)
 for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)
