@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -50,6 +50,8 @@ class Enrolment:
     ends_at: float
     #: The hashes of the passwords of both then, see `Enrolments._stored`.
     stored: _Stored
+    #: `Enrolments.revocations` then.
+    revocations: int
 
 
 class Enrolments:
@@ -60,6 +62,8 @@ class Enrolments:
         self._clock = clock
         self._key = secrets.token_bytes(32)
         self._pending: dict[bytes, Enrolment] = {}
+        #: How often certificates were revoked; codes of before are ended.
+        self.revocations = 0
 
     def begin(
         self,
@@ -71,17 +75,18 @@ class Enrolments:
         """A new code in the place of an earlier one of this user; None when there are too many, of
         all or of those that `by` has begun."""
         now = self._clock()
-        self._pending = {
+        pending = {
             key: each
             for key, each in self._pending.items()
             if each.ends_at > now and each.username != username
         }
-        if len(self._pending) >= MOST or (by is not None and self._begun(by) >= MOST_OF_MAKER):
+        if len(pending) >= MOST or (by is not None and _begun(pending, by) >= MOST_OF_MAKER):
             return None
+        self._pending = pending
         code = secrets.token_urlsafe(_RANDOM)
         stored = self._stored(username, groups, by)
         self._pending[self._digest(code)] = Enrolment(
-            username, groups, with_certificate, by, now + LIFETIME, stored
+            username, groups, with_certificate, by, now + LIFETIME, stored, self.revocations
         )
         return code
 
@@ -94,19 +99,18 @@ class Enrolments:
         return found if found.stored == stored else None
 
     def put_back(self, code: str, enrolment: Enrolment) -> None:
-        """Let the code be used, as nothing came of it; unless there is a later one of this user."""
-        if all(each.username != enrolment.username for each in self._pending.values()):
+        """Let the code be used, as nothing came of it; unless there is a later one of this user, or
+        it was to end meanwhile."""
+        is_ended = enrolment.by is not None and enrolment.revocations != self.revocations
+        if not is_ended and all(
+            each.username != enrolment.username for each in self._pending.values()
+        ):
             self._pending[self._digest(code)] = enrolment
 
     def end_others(self) -> None:
         """End all codes but those that were begun on this computer: certificates were revoked."""
+        self.revocations += 1
         self._pending = {key: each for key, each in self._pending.items() if each.by is None}
-
-    def _begun(self, by: Identity) -> int:
-        return sum(
-            each.by is not None and each.by.username == by.username
-            for each in self._pending.values()
-        )
 
     def _digest(self, code: str) -> bytes:
         return hmac.digest(self._key, code.encode(), "sha256")
@@ -120,3 +124,8 @@ class Enrolments:
             self._hash_of(username) if groups is None else None,
             self._hash_of(maker) if maker is not None else None,
         )
+
+
+def _begun(pending: Mapping[bytes, Enrolment], by: Identity) -> int:
+    """How many of these the user has begun."""
+    return sum(each.by is not None and each.by.username == by.username for each in pending.values())

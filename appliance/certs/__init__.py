@@ -28,7 +28,7 @@ from appliance.certs.contexts import (
 from appliance.certs.export import check_password, write_bundle, write_pkcs12
 from appliance.certs.files import (
     CertificateError,
-    certificate_fingerprint,
+    fingerprints,
     issued_by,
     load_certificates,
     load_key,
@@ -51,12 +51,12 @@ __all__ = [
     "TlsContexts",
     "TlsFiles",
     "TlsPolicy",
-    "certificate_fingerprint",
     "check_client_name",
     "check_new_client",
     "check_password",
     "create_authority",
     "expiries",
+    "fingerprints",
     "issue_client",
     "issue_server",
     "issued",

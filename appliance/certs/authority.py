@@ -476,8 +476,10 @@ def _opened(directory: Path, ca_key: Path | None) -> Iterator[_Authority]:
     problem = out_of_time(certificate_file, certificate, _now())
     if problem:
         raise CertificateError(problem)
-    # Whoever may read the directory could lock that, for as long as they like; not so the key.
-    with locked(directory if ca_key is not None else key_file):
+    # Whoever may read the directory could lock that, for as long as they like; not so the key. It
+    # is locked also for a key that is stored elsewhere: the register is the same.
+    own = directory / "ca.key"
+    with locked(own if own.exists() else directory):
         yield _Authority(directory, certificate, key, _entries(directory, certificate))
 
 

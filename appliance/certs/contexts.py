@@ -89,6 +89,8 @@ class LoadedTls:
     policies: Mapping[str, TlsPolicy]
     username_from: UsernameFrom
     digest: bytes = field(repr=False)
+    #: A hash of which clients' certificates are taken: whose, and without which.
+    trust: bytes = field(repr=False)
     chain: list[x509.Certificate]
     authorities: list[x509.Certificate]
     revocations: Revocations
@@ -124,11 +126,6 @@ class LoadedTls:
         top = self.chain[-1]
         issuers = [each for each in known if each == top or issued_by(top, each)]
         return b"".join(each.public_bytes(Encoding.PEM) for each in issuers)
-
-    @property
-    def trust(self) -> object:
-        """Which clients' certificates are taken: whose, and without which. To be compared."""
-        return self.authorities, self.revocations.dates
 
     def plausible(self, now: datetime) -> datetime:
         """The clock's time, or the earliest that it can be: this program was released and the
@@ -289,7 +286,7 @@ class TlsContexts:
         return self._loaded.warnings(now)
 
     @property
-    def trust(self) -> object:
+    def trust(self) -> bytes:
         """See `LoadedTls.trust`."""
         return self._loaded.trust
 
@@ -336,7 +333,7 @@ def _load(
 ) -> LoadedTls:
     """What is in the files; `before` itself when that has not changed."""
     problems: list[str] = []
-    hashed = hashlib.sha256()
+    hashed, trusted = hashlib.sha256(), hashlib.sha256()
     chain: list[x509.Certificate] = []
     authorities: list[x509.Certificate] = []
     revocations = NOTHING_REVOKED
@@ -344,8 +341,9 @@ def _load(
         chain = _server_chain(files, hashed)
     with _collected(problems):
         if any(policy.client_certificates != "off" for policy in policies.values()):
-            authorities = _client_authorities(files, hashed)
-            revocations = _revocations(files, authorities, hashed, before)
+            authorities = _client_authorities(files, trusted)
+            revocations = _revocations(files, authorities, trusted, before)
+    hashed.update(trusted.digest())
     digest = hashed.digest()
     if before is not None and not problems:
         wanted = (files, policies, username_from, digest)
@@ -375,6 +373,7 @@ def _load(
         policies,
         username_from,
         digest,
+        trusted.digest(),
         chain,
         authorities,
         revocations,

@@ -101,9 +101,10 @@ def parse_certificates(path: Path, data: bytes) -> list[x509.Certificate]:
     return certificates
 
 
-def certificate_fingerprint(path: Path) -> str:
-    """SHA-256 of the first certificate of a file, as browsers and OpenSSL write it."""
-    return load_certificates(path)[0].fingerprint(hashes.SHA256()).hex(":").upper()
+def fingerprints(path: Path) -> list[str]:
+    """SHA-256 of each certificate of a file, as browsers and OpenSSL write it."""
+    found = load_certificates(path)
+    return [each.fingerprint(hashes.SHA256()).hex(":").upper() for each in found]
 
 
 def load_key(path: Path) -> PrivateKeyTypes:
@@ -219,7 +220,7 @@ def _sync_directory(directory: Path) -> None:
 def locked(path: Path) -> Iterator[None]:
     """Lock out other commands, and the appliance itself, that lock this file or directory."""
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        descriptor = _open_to_lock(path)
     except OSError as error:
         raise unreadable(path, error) from error
     try:
@@ -227,3 +228,10 @@ def locked(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _open_to_lock(path: Path) -> int:
+    """Over NFS only what is open for writing can be locked; folders and read-only media cannot."""
+    with contextlib.suppress(OSError):
+        return os.open(path, os.O_RDWR)
+    return os.open(path, os.O_RDONLY)

@@ -195,17 +195,20 @@ def cert_fingerprint(
     ] = False,
     config: ConfigOption = None,
 ) -> None:
-    """SHA-256 of the server's certificate and of the CA's, to compare with what devices show."""
+    """SHA-256 of the server's certificate and of its CA's, to compare with what devices show."""
     settings = load(config)
     from appliance import certs
 
     tls = settings.broker.tls
     try:
-        found = {file: certs.certificate_fingerprint(file) for file in (tls.certificate, tls.ca)}
+        found = [
+            (tls.certificate, certs.fingerprints(tls.certificate)[0]),
+            *((tls.ca, text) for text in certs.fingerprints(tls.ca)),
+        ]
     except certs.CertificateError as error:
         raise CommandError(str(error)) from None
-    width = max(len(file.name) for file in found)
-    for file, text in found.items():
+    width = max(len(file.name) for file, _ in found)
+    for file, text in found:
         if as_json:
             typer.echo(json.dumps({"file": str(file), "sha256": text}))
         else:

@@ -83,6 +83,7 @@ class EnrolmentVerb:
 
     async def _begin(self, caller: Caller, wanted: Enrol) -> dict[str, Any]:
         groups = None if wanted.groups is None else tuple(wanted.groups)
+        revocations = self._enrolments.revocations
         if self._access.in_force.users_path is None:
             raise CallError("rejected", "there is no users file: a plugin knows the users")
         is_known = self._access.knows(wanted.user)
@@ -96,6 +97,8 @@ class EnrolmentVerb:
         if wanted.certificate:
             check_right(self._broker, caller.identity, SIGN)
             await self._phones.check(wanted.user)
+        if revocations != self._enrolments.revocations:
+            raise CallError("failed", "certificates were revoked meanwhile: begin it again")
         code = self._enrolments.begin(wanted.user, groups, caller.identity, wanted.certificate)
         if code is None:
             raise CallError("too_many", "too many enrolments wait for their phones")

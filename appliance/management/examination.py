@@ -42,13 +42,16 @@ class DoctorVerb:
         if self._lock.locked():
             raise CallError("too_many", "an examination is under way")
         async with self._lock:
-            output = await Child(self._command, LONGEST, _NICE).output()
+            # With 1 it says that something is wrong with what it has examined.
+            output = await Child(self._command, LONGEST, _NICE, codes=(0, 1)).output()
         return {"findings": _findings(output)}
 
 
 def _findings(output: bytes) -> list[Any]:
     if len(output) > LONGEST:
         raise CallError("failed", f"the examination has more than {LONGEST} bytes of findings")
+    if not output:
+        raise CallError("failed", "the examination has failed; the log says with which exit code")
     try:
         return [json.loads(line) for line in output.splitlines()]
     except ValueError:

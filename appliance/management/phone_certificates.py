@@ -5,6 +5,7 @@ requests. The key is in no file of this computer.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,10 @@ from appliance.certs.settings import authority_directory
 from appliance.config import BrokerSection
 from appliance.management.child import Child
 from appliance.management.verbs import Caller, Verbs
+from appliance.mqtt.codec import quote
 from appliance.ros.calls.dispatcher import CallError
+
+log = logging.getLogger(__name__)
 
 #: The verb that makes the certificate.
 SIGN: Final = "certificate_sign"
@@ -42,26 +46,32 @@ class PhoneCertificates:
             await asyncio.to_thread(certs.check_new_client, directory, name)
         except CertificateError as error:
             raise CallError("rejected", _without(directory, str(error))) from None
+        except OSError as error:
+            raise CallError("failed", error.strerror or "its files cannot be read") from None
 
     async def make(self, verbs: Verbs, caller: Caller, name: str, password: str) -> bytes:
         """The file of a new key, which the password opens. Raises CallError."""
         await self.check(name)
+        directory = self._directory()
         key, request = certs.new_request(name)
         try:
             made: Any = await verbs.run(caller, SIGN, {"request": request.decode(), "name": name})
             given = packing.given(name, key, made["certificate"], made["ca"], password)
             packed = await asyncio.wait_for(self._packed(given), PACKING)
         except CallError as error:
-            raise CallError(error.code, _without(self._directory(), str(error))) from None
+            raise CallError(error.code, _without(directory, str(error))) from None
         except asyncio.TimeoutError:
             packed = b""
-        if not packed:
+        if not 0 < len(packed) <= packing.LONGEST:
+            log.warning("the .p12 of %s could not be made; revoke its certificate", quote(name))
             raise CallError("failed", "the .p12 could not be made; revoke its certificate")
         return packed
 
     async def _packed(self, given: bytes) -> bytes:
         async with self._lock:
-            return await Child(packing.COMMAND, packing.LONGEST, _NICE).output(given)
+            # Python looks for modules in the current directory first: never in a stranger's.
+            child = Child(packing.COMMAND, packing.LONGEST, _NICE, directory="/")
+            return await child.output(given)
 
     def _directory(self) -> Path:
         broker = self._broker()

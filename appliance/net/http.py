@@ -192,7 +192,7 @@ class HttpLayer(MiddleLayer):
     ) -> None:
         super().__init__(protocol, scheduler)
         self._site = site
-        self._timeout = timeout
+        self._timeout = self._allowed = timeout
         self._http = h11.Connection(h11.SERVER, max_incomplete_event_size=HEAD_LIMIT)
         #: Of the request that is answered; empty for what could not be read.
         self._method = ""
@@ -249,6 +249,7 @@ class HttpLayer(MiddleLayer):
 
     def _limit(self, seconds: float) -> None:
         """Restart the time limit."""
+        self._allowed = seconds
         if self._deadline is not None:
             self._deadline.cancel()
         self._deadline = self._scheduler.entries.later(
@@ -262,7 +263,7 @@ class HttpLayer(MiddleLayer):
             self._end_body(HttpError(408, f"no complete request within {self._timeout:g} s"))
         elif self._busy or not self._writing:
             what = "ready" if self._http.our_state is h11.SEND_RESPONSE else "read"
-            self._protocol.log_refusal("no HTTP answer", f"none was {what} in {self._timeout:g} s")
+            self._protocol.log_refusal("no HTTP answer", f"none was {what} in {self._allowed:g} s")
             self._protocol.abort()
         elif self._received:
             self._refuse(408, f"no complete request within {self._timeout:g} s")

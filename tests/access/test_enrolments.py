@@ -57,6 +57,9 @@ def test_nobody_takes_all_the_places():
     assert enrolments.begin("0", None, ADMIN)  # in the place of the earlier one
     assert enrolments.begin("more", None, Identity("helper", "a"))
     assert enrolments.begin("and more", None, None)
+    here = enrolments.begin("hers", None, None)
+    assert enrolments.begin("hers", None, ADMIN) is None
+    assert here and enrolments.take(here) is not None
 
 
 def test_only_codes_of_this_computer_outlive_a_revocation():
@@ -65,6 +68,17 @@ def test_only_codes_of_this_computer_outlive_a_revocation():
     enrolments.end_others()
     assert from_afar and enrolments.take(from_afar) is None
     assert here and enrolments.take(here) is not None
+
+
+def test_a_code_that_is_being_used_when_certificates_are_revoked():
+    enrolments = Enrolments({}.get, Clock())
+    for by, is_left in ((ADMIN, False), (None, True)):
+        code = enrolments.begin("a", None, by) or ""
+        used = enrolments.take(code)
+        assert used is not None
+        enrolments.end_others()
+        enrolments.put_back(code, used)
+        assert (enrolments.take(code) is not None) is is_left
 
 
 def test_another_password_or_a_removal_ends_a_code():

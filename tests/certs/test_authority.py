@@ -644,7 +644,7 @@ def test_a_server_that_was_revoked_is_renewed_with_a_new_key(own: Path) -> None:
 
 
 def test_a_certificate_that_is_over_makes_room(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The key of the one before is of no use to anybody."""
+    """Nobody logs in with it any more, and it cannot be revoked by its name."""
     _, first = certs.new_request("phone")
     _, second = certs.new_request("phone")
     certs.sign(own, first, "phone")
@@ -665,3 +665,21 @@ def test_who_may_only_read_the_directory_does_not_hold_it_up(own: Path) -> None:
         certs.issue_client(own, "phone")
     finally:
         os.close(descriptor)
+
+
+def test_a_key_that_is_stored_elsewhere_waits_for_the_one_here(own: Path, tmp_path: Path) -> None:
+    """They write the same register."""
+    elsewhere = tmp_path / "stick.key"
+    shutil.copy(own / "ca.key", elsewhere)
+    done = threading.Event()
+
+    def issue() -> None:
+        certs.issue_client(own, "phone", elsewhere)
+        done.set()
+
+    with files.locked(own / "ca.key"):
+        thread = threading.Thread(target=issue)
+        thread.start()
+        assert not done.wait(0.2)
+    assert done.wait(60)
+    thread.join()
