@@ -4,6 +4,8 @@ The one file needs this: its Python and ROS are hardly ever those that a robot's
 with, so that the compiled support of the workspace does not load. rclpy requires a type support
 even for messages that it carries as bytes. Fast DDS then uses only the name and the hash of the
 type, so that the support of an installed type can serve for another type under that type's name.
+Up to Jazzy it also asks for the type's members, for filters by content, which rclpy has not: they
+go nowhere, and are those of the installed type.
 
 Services cannot be bridged this way, as rclpy does not accept or return serialized requests.
 """
@@ -186,6 +188,7 @@ class _Hash(ctypes.Structure):
 
 
 _GET_HASH = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+_FIND = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
 
 
 class _Support:
@@ -198,8 +201,18 @@ class _Support:
         self._callbacks = _Callbacks(namespace.encode(), name.encode(), model.callbacks.functions)
         self._hash = _Hash(1, (ctypes.c_uint8 * 32)(*type_hash)) if type_hash else _Hash()
         self._get_hash = _GET_HASH(lambda _: ctypes.addressof(self._hash))
-        data = ctypes.addressof(self._callbacks)
-        self._handle = _Handle(_IDENTIFIER, data, model.handle.find)
+        self._find = _FIND(
+            lambda _, identifier: (
+                ctypes.addressof(self._handle)
+                if identifier == _IDENTIFIER
+                else ctypes.cast(model.find(identifier), ctypes.c_void_p).value
+            )
+        )
+        self._handle = _Handle(
+            _IDENTIFIER,
+            ctypes.addressof(self._callbacks),
+            ctypes.cast(self._find, ctypes.c_void_p),
+        )
         if model.has_hash:
             self._handle.get_hash = ctypes.cast(self._get_hash, ctypes.c_void_p)
             self._handle.get_description = model.handle.get_description
@@ -211,6 +224,7 @@ class _Support:
 
 
 class _Model(NamedTuple):
+    find: Callable[[bytes], Any]  # the support that has this identifier
     handle: _Handle
     callbacks: _Callbacks
     has_hash: bool
@@ -226,14 +240,14 @@ def _model() -> _Model:
     pointer_in.restype = ctypes.c_void_p
     pointer_in.argtypes = (ctypes.py_object, ctypes.c_void_p)
     runtime = ctypes.CDLL("librosidl_runtime_c.so")
-    find = runtime.get_message_typesupport_handle
-    find.restype = ctypes.POINTER(_Handle)
-    find.argtypes = (ctypes.c_void_p, ctypes.c_char_p)
-    handle = find(pointer_in(kind._TYPE_SUPPORT, None), _IDENTIFIER)
+    get = runtime.get_message_typesupport_handle
+    get.restype = ctypes.POINTER(_Handle)
+    get.argtypes = (ctypes.c_void_p, ctypes.c_char_p)
+    find = functools.partial(get, pointer_in(kind._TYPE_SUPPORT, None))
+    handle = find(_IDENTIFIER)
     if handle and handle.contents.identifier == _IDENTIFIER and handle.contents.data:
         callbacks = _Callbacks.from_address(handle.contents.data)
         if (callbacks.namespace, callbacks.name) == (b"std_msgs::msg", b"String"):
-            return _Model(
-                handle.contents, callbacks, hasattr(runtime, "rosidl_parse_type_hash_string")
-            )
+            has_hash = hasattr(runtime, "rosidl_parse_type_hash_string")
+            return _Model(find, handle.contents, callbacks, has_hash)
     raise UnknownTypeError("only Fast DDS carries types without their compiled support")
