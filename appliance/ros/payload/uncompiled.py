@@ -208,7 +208,7 @@ class _Support:
                 else ctypes.cast(model.find(identifier), ctypes.c_void_p).value
             )
         )
-        self._handle = _Handle(
+        self._handle: _Handle = _Handle(
             _IDENTIFIER,
             ctypes.addressof(self._callbacks),
             ctypes.cast(self._find, ctypes.c_void_p),

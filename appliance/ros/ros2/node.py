@@ -715,13 +715,13 @@ def _timed_subscription() -> Any:
     """
     from rclpy.subscription import Subscription
 
-    class TimedSubscription(Subscription):  # type: ignore[type-arg]  # generic in some versions only
+    class TimedSubscription(Subscription):  # type: ignore[misc]  # rclpy is untyped
         _callback: Any
         _until_timed = 1
         _timed = 0
         since = 0
 
-        @property  # type: ignore[misc]  # an attribute in the base class
+        @property
         def callback(self) -> Any:
             self._until_timed -= 1
             if not self._until_timed:
