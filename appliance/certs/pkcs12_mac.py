@@ -6,6 +6,7 @@ such a file guesses its password against the MAC, and never pays for the rounds 
 
 from __future__ import annotations
 
+import codecs
 import hashlib
 import hmac
 import secrets
@@ -43,7 +44,8 @@ def with_rounds(file: bytes, password: str, rounds: int) -> bytes:
 def derived_key(password: str, salt: bytes, rounds: int) -> bytes:
     """The key of the MAC, RFC 7292 appendix B.2 with SHA-1: one block is all of it."""
     size = hashlib.sha1().block_size
-    written = password.encode("utf-16-be") + b"\0\0"
+    # Not `encode`, which loads a module: root that acts as the service's user may not find it.
+    written = codecs.utf_16_be_encode(password)[0] + b"\0\0"
     digest = hashlib.sha1(_INTEGRITY * size + _filled(salt, size) + _filled(written, size)).digest()
     for _ in range(rounds - 1):
         digest = hashlib.sha1(digest).digest()

@@ -8,7 +8,6 @@ from typing import Annotated, Final
 import typer
 
 from appliance.cli.connection import ManagedAppliance, connecting
-from appliance.ops.logs import VISIBLE_IN_LINES
 
 #: The most lines that the verbs answer with.
 _MOST: Final = 1000
@@ -26,6 +25,8 @@ def log(
 ) -> None:
     """Print the last lines of the running appliance's log, here or, with --user and --host, over
     MQTT."""
+    from appliance.ops.logs import VISIBLE_IN_LINES
+
     answer = options.ask("audit" if audit else "log", {"lines": lines})
     found = map(json.dumps, answer["entries"]) if audit else answer["lines"]
     for line in found:
