@@ -76,6 +76,9 @@ log = logging.getLogger(__name__)
 #: The cost of a packet that is not of the data path.
 PACKET_COST = 5
 
+#: How many acknowledgements make room before the window is filled again.
+ROOM_FILLED_AT_ONCE = 32
+
 #: Bytes of a partial packet, such as a CONNECT before its login, that there is always memory for.
 SMALL_PACKET = 1024
 
@@ -197,6 +200,7 @@ class ClientHandler:
         inflow = self.inflow
         if inflow.is_watched:
             inflow.chunk_received(data, now)
+        room = 0  # messages that were acknowledged, and the window not filled since
         try:
             events: Iterable[Event]
             if inflow.unfinished and now - inflow.unfinished > DELAYED_AFTER:
@@ -211,9 +215,17 @@ class ClientHandler:
                     self._on_raw_publish(event)
                 elif type(event) is int:
                     counters.cost += 1
-                    if event < PUBREC and self.session is not None:  # PUBACK: most of them
+                    session = self.session
+                    if event < PUBREC and session is not None:  # PUBACK: most of them
                         counters.control_received += 1
-                        self.session.puback(event & 0xFFFF)
+                        if session.acknowledged(event & 0xFFFF):
+                            # A reader of a full queue acknowledges many in a chunk: to fill the
+                            # window once for them takes a sixth less than once for each. A few at
+                            # a time, as each may make room for a message of any cost.
+                            room += 1
+                            if room == ROOM_FILLED_AT_ONCE:
+                                room = 0
+                                session.fill_window()
                     else:
                         self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
                 else:
@@ -226,6 +238,8 @@ class ClientHandler:
         except ProtocolError as error:
             counters.cost += FAILURE_COST + protocol.cost
             self.fail(error)
+        if room and self.session is not None:
+            self.session.fill_window()
         if self._behind and protocol.paused and not self._later and self._work is None:
             if self._has_place_behind():
                 self.receive(b"")

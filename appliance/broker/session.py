@@ -614,11 +614,19 @@ class Session:
     # --- acknowledgements of the client --------------------------------------------------------
 
     def puback(self, packet_id: int) -> bool:
-        """Process PUBACK; False when no message with that id is in flight.
+        """Process PUBACK, and send what it makes room for; False when no message with that id is in
+        flight.
 
         Raises:
             ProtocolError: the message with that id does not wait for a PUBACK.
         """
+        is_known = self.acknowledged(packet_id)
+        if is_known:
+            self.fill_window()
+        return is_known
+
+    def acknowledged(self, packet_id: int) -> bool:
+        """The part of `puback` that makes room; `fill_window` has to follow."""
         delivery = self.inflight.get(packet_id)
         if delivery is None or delivery[1] != 1:
             if packet_id in self.inflight:
@@ -633,12 +641,14 @@ class Session:
         self.accounting.queued_bytes -= size
         if self.expiry:
             self.accounting.store.settled(self, delivery)
-        congestion = self.congestion
-        if congestion is not None:
-            congestion.acknowledged(packet_id, size)
-        if self.queue or self.replays or self.resends or congestion is not None:
-            self.pump()
+        if self.congestion is not None:
+            self.congestion.acknowledged(packet_id, size)
         return True
+
+    def fill_window(self) -> None:
+        """Send what acknowledgements have made room for."""
+        if self.queue or self.replays or self.resends or self.congestion is not None:
+            self.pump()
 
     def pubrec(self, packet_id: int, code: int) -> bool:
         """Process PUBREC, which may refuse the message; False when no message has that id.

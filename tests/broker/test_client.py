@@ -6,7 +6,9 @@ Statements of the standards are named as `[MQTT-…]`, those of 5.0 with `v5` wh
 from __future__ import annotations
 
 import gc
+import random
 import weakref
+from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,6 +26,7 @@ from appliance.mqtt.packets import (
     Connack,
     Connect,
     Disconnect,
+    Packet,
     Pingreq,
     Pingresp,
     Puback,
@@ -39,7 +42,16 @@ from appliance.mqtt.packets import (
 )
 from appliance.mqtt.reason import ReasonCode
 
-from .conftest import FakeAccess, Join, Peer, drops, lasting, waiting_bytes
+from .conftest import (
+    FakeAccess,
+    FakeStore,
+    Join,
+    Peer,
+    check_accounts,
+    drops,
+    lasting,
+    waiting_bytes,
+)
 
 P = Property
 
@@ -865,3 +877,52 @@ def test_a_packet_cut_in_two_is_as_old_as_its_first_byte(
     broker.accounting.now += 0.05
     peer.send(command[5:])
     assert ages == [pytest.approx(3.05), 0.0]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_acknowledgements_in_one_chunk_do_what_they_do_one_by_one(
+    access: FakeAccess, seed: int
+) -> None:
+    """The window is filled once for many of them; the same is sent, in the same order."""
+    chance = random.Random(seed)
+    script: list[tuple[int, int]] = []  # how many are published, and then acknowledged
+    for _ in range(12):
+        script.append((chance.randint(0, 80), chance.randint(0, 60)))
+    sent = []
+    for together in (True, False):
+        broker = Broker(access, FakeStore(), Limits(inflight=50))
+        broker.tick(1000.0)
+        reader, writer = Peer(broker), Peer(broker)
+        for peer, name in ((reader, "reader"), (writer, "writer")):
+            assert peer.connect(name).reason_code == ReasonCode.SUCCESS
+        reader.subscribe("a", qos=1)
+        arrived: list[tuple[int | None, bytes]] = []
+        unacknowledged: deque[int | None] = deque()
+        number = 0
+        for published, acknowledged in script:
+            for _ in range(published):
+                number += 1
+                writer.send(Publish("a", b"%d" % number, packet_id=writer.next_id(), qos=1))
+            for each in reader.messages():
+                arrived.append((each.packet_id, each.payload))
+                unacknowledged.append(each.packet_id)
+            first = [
+                unacknowledged.popleft() for _ in range(min(acknowledged, len(unacknowledged)))
+            ]
+            packets: list[Packet] = [Puback(each or 0) for each in first]
+            packets.insert(len(packets) // 2, Puback(60_000))  # of no message
+            packets.append(Publish("b", b"between", packet_id=reader.next_id(), qos=1))
+            if together:
+                reader.send(*packets)
+            else:
+                for packet in packets:
+                    reader.send(packet)
+            for each in reader.received():
+                if isinstance(each, Publish):
+                    arrived.append((each.packet_id, each.payload))
+                    unacknowledged.append(each.packet_id)
+        sent.append(arrived)
+        assert len(arrived) > 100
+        # What the two hold is given back, as the fixture would check.
+        check_accounts(broker)
+    assert sent[0] == sent[1]
