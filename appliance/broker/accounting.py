@@ -46,6 +46,7 @@ class Accounting:
     #: full (`CongestedReader`), and the disk (`DiskCongestion`).
     congested: dict[object, None] = field(default_factory=dict)
     #: The limits that every message is checked against, copied from `limits` for speed.
+    queue_messages: int = field(init=False)
     queue_bytes: int = field(init=False)
     half_queue: int = field(init=False)
     memory: int = field(init=False)
@@ -71,6 +72,7 @@ class Accounting:
     def use(self, limits: Limits) -> None:
         """Apply other limits from now on."""
         self.limits = limits
+        self.queue_messages = limits.queue_messages
         self.queue_bytes = limits.queue_bytes
         self.half_queue = limits.queue_bytes // 2
         # An eighth is reserved, so that users that hold much do not starve those that hold little.

@@ -350,8 +350,12 @@ class ClientHandler:
             self._on_publish_qos2(session, packet_id, message, route)
             return
         code = self.broker.publish_to(targets, route, message, session)
-        if qos:
+        if not qos:
+            return
+        if code or message.rejection is not None:
             self._answer(packet_id, code, route, message)
+        else:
+            self.output.acknowledge(0x40, packet_id, 0)
 
     def _on_publish(self, packet: Publish) -> None:
         """Process a PUBLISH from the full decoder; most likely it has properties."""
@@ -503,7 +507,11 @@ class ClientHandler:
             self.transport.wait(max(allowance.wait(self, congestions, now), RECHECK))
         else:
             allowance.end_wait(self)
-            if not route.allowed or not broker.must_wait_for_disk(route, message, session):
+            if (
+                broker.disk not in self._congested  # asked here too, which saves a call
+                or not route.allowed
+                or not broker.must_wait_for_disk(route, message, session)
+            ):
                 return False
             if self._hurries:  # its client has left, and was not told that it had come
                 self._counters.drop("not_stored")

@@ -230,7 +230,7 @@ class Session:
                 link.publish(message, 0, 0, False, retain, subscription_ids)
                 return True
             return self.keep_latest(cast(Delivery, (message, 0, retain, subscription_ids, share)))
-        # `fits` and `_count` are inlined here and in `_send`, which saves two calls per message.
+        # `fits` and `_count` are inlined here and in `_enqueue`, which saves two calls per message.
         accounting = self.accounting
         size = message.size
         if (
@@ -244,9 +244,12 @@ class Session:
                 and not self.queue
                 and not self.replays
             ):
+                self.bytes += size
+                self.account.bytes += size
+                accounting.queued_bytes += size
                 self._send(link, cast(Delivery, (message, qos, retain, subscription_ids, share)))
                 return True
-            if len(self.queue) < accounting.limits.queue_messages:
+            if len(self.queue) < accounting.queue_messages:
                 return self._enqueue(
                     cast(Delivery, (message, qos, retain, subscription_ids, share)), refusable
                 )
@@ -301,9 +304,12 @@ class Session:
             self._depend_on_batch()
             self.accounting.store.queued(self, delivery)
         message.settle()
-        self._count(message)
+        size = message.size
+        self.bytes += size
+        self.account.bytes += size
+        self.accounting.queued_bytes += size
         self.queue.append(delivery)
-        if self.congestion is None and 2 * len(self.queue) > self.accounting.limits.queue_messages:
+        if self.congestion is None and 2 * len(self.queue) > self.accounting.queue_messages:
             self._congest()
         return True
 
@@ -319,7 +325,7 @@ class Session:
         if self.expiry and refusable and self.accounting.failing:
             return False
         while self.queue and not (
-            len(self.queue) < accounting.limits.queue_messages and self.fits(message.size)
+            len(self.queue) < accounting.queue_messages and self.fits(message.size)
         ):
             self._report_full(message.size)
             oldest = self.queue.popleft()
@@ -407,22 +413,27 @@ class Session:
                     self.replays[topic_filter] = itertools.chain((delivery,), deliveries)
                     break
                 if qos:
+                    self._count(message)
                     self._send(link, delivery)
                 else:
                     self._publish(link, delivery)
         return True
 
     def _pump_queue(self, link: Link) -> None:
-        while self.queue and link.writable and len(self.inflight) < self.window:
+        inflight = self.inflight
+        while self.queue and link.writable and len(inflight) < self.window:
             delivery = self.queue.popleft()
             message = delivery[0]
-            self._uncount(message)
-            if self.accounting.has_expired(message) or self._is_forbidden(message):
+            # Most messages neither expire nor have to be checked, which saves two calls for each.
+            if (message.expires_at is not None and self.accounting.has_expired(message)) or (
+                self.unchecked and self._is_forbidden(message)
+            ):
+                self._uncount(message)
                 self._settled(delivery)
                 # Its packet id is skipped, as in mosquitto, which assigns ids on queueing.
                 self._last_packet_id = self._last_packet_id % 65535 + 1
             else:
-                self._send(link, delivery)
+                self._send(link, delivery)  # it stays counted
 
     def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
         """Drop queued messages that are too old; returns their number."""
@@ -491,16 +502,13 @@ class Session:
         self.pump()
 
     def _send(self, link: Link, delivery: Delivery) -> None:
+        """Send a QoS 1 or 2 message that is counted already."""
         message, qos, retain, subscription_ids, _ = delivery
         inflight = self.inflight
         packet_id = self._last_packet_id % 65535 + 1
         while packet_id in inflight:  # [MQTT-2.2.1-3]
             packet_id = packet_id % 65535 + 1
         self._last_packet_id = packet_id
-        size = message.size
-        self.bytes += size
-        self.account.bytes += size
-        self.accounting.queued_bytes += size
         inflight[packet_id] = delivery
         if self.congestion is not None:
             self.congestion.sent(packet_id)
@@ -810,20 +818,19 @@ class Session:
         accounting = self.accounting
         if self.congestion is not None and self.congestion.awaited:
             return True
-        if len(self.queue) >= accounting.limits.queue_messages:
+        if len(self.queue) >= accounting.queue_messages:
             return True
-        is_little = self.bytes + size <= accounting.half_queue
-        return not (
-            is_little and accounting.queued_bytes + size <= accounting.unrestricted_memory
-        ) and not self.fits(size)
+        if (
+            self.bytes + size <= accounting.half_queue
+            and accounting.queued_bytes + size <= accounting.unrestricted_memory
+        ):
+            return False
+        return not self.fits(size)
 
     def _is_crowded(self) -> bool:
         """Whether the queue is more than half full."""
         accounting = self.accounting
-        return (
-            2 * len(self.queue) > accounting.limits.queue_messages
-            or self.bytes > accounting.half_queue
-        )
+        return 2 * len(self.queue) > accounting.queue_messages or self.bytes > accounting.half_queue
 
     def _fits_tightly(self, size: int) -> bool:
         """`fits`, for a message that makes the session use more than half of its limit."""

@@ -222,6 +222,16 @@ class PacketFramer:
                         continue
                 length = buf[pos + 1]
                 body = pos + 2
+                if (
+                    length == 2
+                    and first in _ACKNOWLEDGEMENTS
+                    and end - pos >= 4
+                    and (buf[body] or buf[body + 1])
+                    and self.state is State.CONNECTED
+                ):
+                    yield _ACKNOWLEDGEMENTS[first] | buf[body] << 8 | buf[body + 1]
+                    pos += 4
+                    continue
                 if length > 0x7F:
                     check_type(first)
                     try:
@@ -266,8 +276,6 @@ class PacketFramer:
                             buf[payload:stop],
                             head if packet_id else buf[pos:stop],
                         )
-                elif length == 2 and first in _ACKNOWLEDGEMENTS and (buf[body] or buf[body + 1]):
-                    yield _ACKNOWLEDGEMENTS[first] | buf[body] << 8 | buf[body + 1]
                 else:
                     self._check(first, stop - pos)
                     yield self._decode(first, buf[body:stop])
