@@ -33,22 +33,23 @@ Each message that was offered is in the end sent, dropped for a reason, or set a
 
 from __future__ import annotations
 
-import heapq
 import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Final
 
-from appliance.broker.backlogs import Backlogs, RecordsLostError, Segment
+from appliance.broker.backlogs import Backlogs, Segment
 from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.upstream.backlog_counts import BacklogCounts, DropReason, Tally, too_old
 from appliance.upstream.disk_room import DiskRoom
+from appliance.upstream.eviction import Eviction
 from appliance.upstream.latest_values import LatestValue
 from appliance.upstream.live_messages import LiveMessages
 from appliance.upstream.rates import TokenBucket
-from appliance.upstream.records import RecordDecoder, encode_record, record_times
+from appliance.upstream.read_ahead import MOST_LATER, ReadAhead
+from appliance.upstream.records import RecordDecoder, encode_record
+from appliance.upstream.retries import Retries
 from appliance.upstream.rule_queue import (
     AGAIN,
     ENTRY_OVERHEAD,
@@ -56,18 +57,17 @@ from appliance.upstream.rule_queue import (
     IN_FLIGHT,
     LATER,
     LOADED_OVERHEAD,
-    READ_AGAIN,
     Entry,
     HeldSegment,
     RuleQueue,
     size_left,
 )
-from appliance.upstream.rules import PRIORITIES, BacklogLimits, OutRule, Priority
+from appliance.upstream.rule_queues import HELD, RuleQueues, bucket_of
+from appliance.upstream.rules import PRIORITIES, BacklogLimits, OutRule
 from appliance.upstream.set_aside import AsideRecords, SetAside
 from appliance.upstream.stored_rows import (
     StoredRows,
     later_row,
-    numbers_row,
 )
 
 log = logging.getLogger(__name__)
@@ -75,31 +75,18 @@ log = logging.getLogger(__name__)
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
 
-#: Bytes of memory: of messages in flight, and of records that were read. With those of
-#: `LiveMessages`, and what a higher lane gets in addition, it is 8 MiB a link. What is not `Final`
-#: here tests replace, also in the compiled build.
+#: Bytes of memory of messages in flight. With `LOADED_SIZE`, those of `LiveMessages`, and what a
+#: higher lane gets in addition, it is 8 MiB a link.
 IN_FLIGHT_SIZE: Final = 3 * MIB
-LOADED_SIZE = 5 * MIB // 4
 
 #: Bytes that may be in flight in addition while messages wait to be sent again: otherwise one in a
 #: higher lane would wait for all of them. However many wait to be tried again, each rule of which
 #: none does may have as many.
 IN_FLIGHT_RESERVE: Final = 256 * KIB
 
-#: Bytes of read records that a rule has at least, however many rules there are.
-LOADED_SHARE = 32 * KIB
-
 #: After so many messages of other lanes it is a lane's turn. Both lower lanes may have waited, so
 #: that each gets one in 16.
 TURN: Final = 14
-
-#: Messages of a rule that wait to be tried again (0x97); with more, no other of that rule is sent
-#: until one is due. Other rules go on: the fleet's broker may refuse one user's topics only.
-MOST_LATER = 100
-
-#: Seconds until a message is tried again; doubled each time up to the second value.
-FIRST_RETRY: Final = 1.0
-LONGEST_RETRY: Final = 60.0
 
 #: Seconds after which a message says when it was published.
 DELAYED: Final = 1.0
@@ -109,9 +96,6 @@ MOST_DROPPED: Final = 1000
 
 #: The largest Message Expiry Interval, in seconds.
 _LONGEST_EXPIRY: Final = 0xFFFF_FFFF
-
-#: The name of the queue of messages that are too large for now; no filter has such a character.
-HELD: Final = "\0too large"
 
 #: What is too large for now waits in so many messages at most, and this part of the backlog's size.
 MOST_HELD: Final = 10_000
@@ -155,22 +139,24 @@ class Backlog:
         #: Whether `next` had nothing and nobody was woken since.
         self._idle = True
 
-        self._queues: dict[str, RuleQueue] = {}
-        #: By the identity of each of these rules, which is faster than the value.
-        self._rules: list[OutRule] = []
-        self._of_rule: dict[int, RuleQueue] = {}
-        self._lanes: list[list[RuleQueue]] = [[] for _ in PRIORITIES]
+        self._queues = RuleQueues(name, backlogs, self._latest)
         #: By lane: messages of other lanes since its last one, and whether `live` is next.
         self._passed = [0] * len(PRIORITIES)
         self._live_first = [False] * len(PRIORITIES)
-        #: Bytes of read records that each rule may have in memory.
-        self._share = LOADED_SIZE
-        #: The rule that has a record in memory which exceeds its share.
-        self._oversized: RuleQueue | None = None
-
         self._tally = Tally()
         self._live = LiveMessages(
             name, self._latest, self._single, limits, self._tally, self._discard, self._wake_up
+        )
+        self._read_ahead = ReadAhead(name, self._tally, self._lost, self._wake_up)
+        self._eviction = Eviction(
+            name,
+            self._queues,
+            limits,
+            self._tally,
+            self._live,
+            self._read_ahead,
+            self._discard,
+            self._check_emptied,
         )
         self._decoder = RecordDecoder()
         #: Handed out and not settled, by number, in this order.
@@ -178,24 +164,17 @@ class Backlog:
         #: Bytes of memory: in flight, and to be sent again.
         self._flying_size = 0
         self._again_size = 0
-        #: To be tried again: when, number, entry; and how many of them are not GONE.
-        self._later: list[tuple[float, int, Entry]] = []
-        self._later_count = 0
-        #: Their bytes of memory, which are a part of `_again_size`.
-        self._later_size = 0
+        #: To be tried again; their bytes of memory are a part of `_again_size`.
+        self._retries = Retries()
         #: Numbers of messages that were stored by themselves and may be in a journal as well, as
         #: what was settled there out of order was not stored.
         self._repeated: set[int] = set()
-        self._full_since: int | None = None
         self._log = RateLimitedLog()
         #: The bytes of a packet at which all held messages are known to be too large; and at which
         #: those were that have not been handed out on this connection, which takes more.
         self._held_at = 0.0
         self._held_before = math.inf
 
-        #: By rule: the number of its journal; and the key of the row that says so.
-        self._numbers: dict[str, int] = {}
-        self._numbers_key: int | None = None
         self._aside = AsideRecords(backlogs.aside(name))
         self._follow(rules, rate, bytes_per_second, now)
         self._restore()
@@ -218,8 +197,9 @@ class Backlog:
         """
         self._limits = limits
         self._live.use(limits)
+        self._eviction.use(limits)
         self._follow(rules, rate, bytes_per_second, now)
-        self._forget_drained()
+        self._queues.forget_drained()
         self._sort()
 
     def _follow(
@@ -229,60 +209,13 @@ class Backlog:
         bytes_per_second: float | None,
         now: float,
     ) -> None:
-        self._bucket = _bucket(self._bucket, rate, now)
-        self._byte_bucket = _bucket(self._byte_bucket, bytes_per_second, now)
-        for queue in self._queues.values():
-            queue.configured = False
-        self._rules = list(rules)
-        self._of_rule.clear()
-        for rule in self._rules:
-            self._of_rule[id(rule)] = self._configure(rule, now)
-
-    def _configure(self, rule: OutRule, now: float) -> RuleQueue:
-        name = rule.local_filter
-        queue = self._queues.get(name)
-        if queue is None:
-            queue = self._queues[name] = RuleQueue(rule)
-        elif not queue.configured:
-            if not queue.mixed and queue.stored:
-                queue.note_restored(self._number)  # their topics were not noted
-            queue.use(rule)
-        queue.configured = True
-        queue.bucket = _bucket(queue.bucket, queue.rule.rate, now)
-        return queue
+        self._bucket = bucket_of(self._bucket, rate, now)
+        self._byte_bucket = bucket_of(self._byte_bucket, bytes_per_second, now)
+        self._queues.follow(rules, self._number, now)
 
     def _sort(self) -> None:
-        for queues in self._lanes:
-            queues.clear()
-        for queue in self._queues.values():
-            self._lanes[queue.lane].append(queue)
-        self._share = max(LOADED_SHARE, LOADED_SIZE // max(1, len(self._queues)))
-
-    def _forget_drained(self) -> None:
-        """Forget rules that are no more and for which nothing waits."""
-        drained = [each for each in self._queues.values() if not each.configured]
-        drained = [each for each in drained if not each.messages]
-        for queue in drained:
-            del self._queues[queue.name]
-            self._numbers.pop(queue.name, None)
-        if any(queue.number >= 0 for queue in drained):
-            self._put_numbers()
-        if drained:
-            self._sort()
-
-    def _put_numbers(self) -> None:
-        row = numbers_row(self._numbers)
-        self._numbers_key = self._latest.put(self._numbers_key, row, awaited=False)
-
-    def _open_journal(self, queue: RuleQueue) -> None:
-        """Give the rule a journal; the number of it is stored before the first record."""
-        number = self._numbers.get(queue.name)
-        if number is None:
-            number = 1 + max(self._numbers.values(), default=-1)
-            self._numbers[queue.name] = number
-            self._put_numbers()
-        queue.number = number
-        queue.journal = self._backlogs.journal(self._name, number)
+        self._queues.sort()
+        self._read_ahead.divide(len(self._queues.by_name))
 
     # --- what was stored ------------------------------------------------------------------------
 
@@ -294,10 +227,7 @@ class Backlog:
             self._latest.remove(key)
         for key in rows.loaded:
             self._latest.remove(key)
-        self._numbers, self._numbers_key = rows.numbers, rows.numbers_key
-        for name in self._numbers:
-            queue = self._orphaned(name)
-            self._open_journal(queue)
+        for queue in self._queues.restore(rows.numbers, rows.numbers_key):
             assert queue.journal is not None
             segments = queue.journal.segments()
             queue.stored = sum(segment.count - segment.done for segment in segments)
@@ -309,13 +239,13 @@ class Backlog:
         for each in single.difference(value.single for value in values.values()):
             self._single.remove(each)
         for (name, topic), value in sorted(values.items(), key=lambda each: each[1].number):
-            queue = self._orphaned(name)
+            queue = self._queues.orphaned(name)
             if (value.qos or not queue.mixed) and queue.last_stored(topic):
                 value.after = value.number  # numbers of the journal are below, or of newer messages
             self._live.keep(queue, value)
             self._tally.add(queue, 1, value.size)
         for record, size, key in rows.later:
-            entry = Entry(self._orphaned(record.rule), record, size)
+            entry = Entry(self._queues.orphaned(record.rule), record, size)
             entry.key = key
             self._tally.add(entry.queue, 1, size)
             entry.state = AGAIN
@@ -327,17 +257,7 @@ class Backlog:
     def store(self) -> None:
         """The link ends, and `rewind` was called: store what can be of what is in memory alone."""
         if not self._backlogs.failing:
-            self._live.store(self._queues.values())
-
-    def _orphaned(self, name: str) -> RuleQueue:
-        """The queue of a rule that may not be in the configuration any more."""
-        queue = self._queues.get(name)
-        if queue is None:
-            # What cannot be sent now is the first to be dropped.
-            priority: Priority = "low" if name == HELD else "normal"
-            queue = self._queues[name] = RuleQueue(OutRule(name, "", "", priority=priority))
-            queue.configured = False
-        return queue
+            self._live.store(self._queues.by_name.values())
 
     # --- in ---------------------------------------------------------------------------------------
 
@@ -362,7 +282,7 @@ class Backlog:
         may be acknowledged for it, who is then asked to wait (`must_wait`) before it is offered.
         `user` has published it, see `UserShares`.
         """
-        queue = self._of_rule.get(id(rule)) or self._queue_of(rule, now)
+        queue = self._queues.of(rule) or self._queue_of(rule, now)
         kept = queue.kept[2 * qos + retain]
         self._tally.offered += 1
         if kept == "none" and not self._online:
@@ -393,7 +313,7 @@ class Backlog:
             added = size - replaced.size if replaced is not None else size
             if self._tally.bytes + added <= self._limits.size:
                 break
-            if not self._make_room(queue.lane, added, now):
+            if not self._eviction.make_room(queue.lane, added, now):
                 return self._refuse(queue)
         if kept == "all":
             if self._backlogs.failing:
@@ -406,7 +326,9 @@ class Backlog:
                 is_known = before is not None and before.single is not None
                 if is_known or self._live.has_topic_room(topic):
                     break
-                if self._limits.when_full == "refuse" or not self._drop_oldest_latest(queue.lane):
+                if self._limits.when_full == "refuse" or not self._eviction.drop_oldest_latest(
+                    queue.lane
+                ):
                     return self._refuse(queue)
             if (persistent or not in_memory) and self._backlogs.failing:
                 return self._cannot_store(queue, qos)
@@ -415,7 +337,7 @@ class Backlog:
             self._live.offer(queue, value, data, persistent=persistent, in_memory=in_memory)
         else:
             memory = size + LOADED_OVERHEAD
-            if not self._make_live_room(queue.lane, memory):
+            if not self._eviction.make_live_room(queue.lane, memory):
                 self._tally.drop(queue, DropReason.FULL)
                 return None
             self._live.put(queue, data)
@@ -430,19 +352,19 @@ class Backlog:
 
     def _queue_of(self, rule: OutRule, now: float) -> RuleQueue:
         """The queue of an equal rule, or of one that is new."""
-        queue = self._queues.get(rule.local_filter)
+        queue = self._queues.by_name.get(rule.local_filter)
         if queue is None or not queue.configured:
-            queue = self._configure(rule, now)
+            queue = self._queues.configure(rule, self._number, now)
             self._sort()
         return queue
 
     def _refuse(self, queue: RuleQueue) -> str | None:
         if self._limits.when_full == "refuse":
             self._tally.drop(queue, DropReason.REFUSED)
-            self._say_full()
+            self._eviction.say_full()
             return f"the backlog of {self._name} is full"
         self._tally.drop(queue, DropReason.FULL)
-        self._say_full()
+        self._eviction.say_full()
         return None
 
     def _cannot_store(self, queue: RuleQueue, qos: int) -> str | None:
@@ -462,7 +384,7 @@ class Backlog:
         """Whether the publisher of such a message should wait until more is written, where it is
         acknowledged: the message would be in memory until then. `size` is about its bytes.
         """
-        queue = self._queues.get(rule.local_filter)
+        queue = self._queues.by_name.get(rule.local_filter)
         return (
             queue is not None
             and self._disk.must_wait(queue.lane)
@@ -492,226 +414,33 @@ class Backlog:
     ) -> Segment:
         journal = queue.journal
         if journal is None:
-            self._open_journal(queue)
+            self._queues.open_journal(queue)
             journal = queue.journal
             assert journal is not None
         segment = journal.append(data, awaited=awaited)
         queue.stored += 1
         if queue.mixed:
             queue.note_topic(topic, number)
-        size = len(data)
-        if not queue.behind and self._has_memory(queue, size):
-            queue.keep(segment, data)
-        elif queue.arriving is not None and queue.arriving_size + size <= self._share:
-            queue.arriving.append((segment, segment.count - 1, data))
-            queue.arriving_size += size + LOADED_OVERHEAD
-            queue.spill(segment)
-        else:
-            queue.arriving = None
-            queue.spill(segment)
+        self._read_ahead.appended(queue, segment, data)
         return segment
 
-    def _has_memory(self, queue: RuleQueue, size: int) -> bool:
-        """Whether a record of this size may be read now."""
-        if queue.loaded + size + LOADED_OVERHEAD <= self._share:
-            return True
-        if queue.waiting or not self._may_exceed():
-            return False
-        self._oversized = queue
-        return True
-
-    def _may_exceed(self) -> bool:
-        """Whether a rule may have a record in memory that exceeds its share.
-
-        One has: the others wait until that is sent, unless its rule is itself made to wait.
-        """
-        owner = self._oversized
-        return (
-            owner is None
-            or not owner.passes
-            or owner.later >= MOST_LATER
-            or owner.bucket is not None
-        )
-
-    # --- full -------------------------------------------------------------------------------------
-
-    def _make_room(self, lane: int, size: int, now: float) -> bool:
-        """Drop until a message of the lane has room: too old ones, then the lowest lane's oldest,
-        in it the latest ones of who has more than a share of these first.
-
-        Whatever is more urgent than the message stays.
-        """
-        limit = self._limits.size - size
-        if limit < 0:
-            return False
-        for queue in self._queues.values():
-            self._drop_outdated(queue, now)
-        if self._tally.bytes <= limit:
-            return True
-        if self._limits.when_full == "refuse":
-            return False
-        self._say_full()
-        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            queues = self._lanes[lowest]
-            while self._tally.bytes > limit and (
-                self._live.drop_of_largest(queues) or self._drop_oldest(lowest)
-            ):
-                pass
-        return self._tally.bytes <= limit
-
-    def _drop_oldest(self, lane: int) -> bool:
-        """Drop the oldest message of a lane, or the oldest segment on disk; False without any."""
-        oldest = math.inf
-        found: RuleQueue | None = None
-        is_live = False
-        for queue in self._lanes[lane]:
-            stored = queue.oldest_stored()
-            if stored is not None and stored < oldest:
-                oldest, found, is_live = stored, queue, False
-            live = queue.oldest_live()
-            if live is not None and live < oldest:
-                oldest, found, is_live = live, queue, True
-        if found is None:
-            return False
-        if is_live:
-            self._drop_first_live(found, DropReason.FULL)
-        else:
-            self._drop_first_stored(found, DropReason.FULL)
-        return True
-
-    def _drop_oldest_latest(self, lane: int) -> bool:
-        """Drop the oldest latest message of the lowest lane that is not above, first of who has
-        more than a share; False if none."""
-        self._say_full()
-        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            if self._live.drop_of_largest(self._lanes[lowest], topics=True):
-                return True
-            firsts = [
-                (value.number, queue, value)
-                for queue in self._lanes[lowest]
-                if (value := queue.latest.oldest()) is not None
-            ]
-            if firsts:
-                _, queue, value = min(firsts, key=lambda each: each[0])
-                self._live.drop(queue, value, DropReason.FULL)
-                return True
-        return False
-
-    def _drop_first_stored(self, queue: RuleQueue, reason: DropReason) -> None:
-        """Drop what is the first of `again`, of `waiting` or of what is not read."""
-        queue.skip_gone()
-        if queue.again:
-            self._discard(queue.again.popleft(), reason)
-        elif queue.waiting:
-            data, part, index = self._pop_waiting(queue)
-            self._tally.remove(queue, len(data))
-            self._tally.drop(queue, reason)
-            queue.settle(part, index)
-            self._check_emptied(queue)
-        else:
-            self._drop_unread(queue, queue.unread(), reason)
-
-    def _drop_unread(self, queue: RuleQueue, segment: Segment | None, reason: DropReason) -> None:
-        count, size = queue.drop_unread(segment)
-        self._tally.add(queue, -count, -size)
-        self._tally.drop(queue, reason, count)
-        self._check_emptied(queue)
-
-    def _drop_first_live(self, queue: RuleQueue, reason: DropReason) -> None:
-        value = queue.latest.oldest()
-        if value is not None:
-            self._live.drop(queue, value, reason)
-            return
-        data = self._live.pop(queue)
-        self._tally.remove(queue, len(data))
-        self._tally.drop(queue, reason)
-
-    def _make_live_room(self, lane: int, memory: int) -> bool:
-        """Drop what is forgotten with the connection until so many bytes have room.
-
-        As for `_make_room`.
-        """
-        if self._live.fits(memory):
-            return True
-        self._say_full()
-        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            while not self._live.fits(memory):
-                waiting = [queue for queue in self._lanes[lowest] if queue.live]
-                if not waiting:
-                    break
-                oldest = min(waiting, key=lambda queue: record_times(queue.live[0])[0])
-                data = self._live.pop(oldest)
-                self._tally.remove(oldest, len(data))
-                self._tally.drop(oldest, DropReason.FULL)
-        return not self._live.memory or self._live.fits(memory)
-
-    def _say_full(self) -> None:
-        """Log that messages are dropped, once until what waits is half as much."""
-        if self._full_since is None:
-            self._full_since = self._tally.dropped_as_full()
-            what = (
-                "messages are refused"
-                if self._limits.when_full == "refuse"
-                else "the oldest messages of the lowest lane are dropped"
-            )
-            log.warning(
-                "the backlog of %s is full (%d messages, %d bytes): %s",
-                self._name,
-                self._tally.messages,
-                self._tally.bytes,
-                what,
-            )
+    # --- too old ----------------------------------------------------------------------------------
 
     def tick(self, now: float) -> None:
         """Drop what has become too old; to be called every second or so."""
         self._log.tick(now)
-        for queue in self._queues.values():
-            self._drop_outdated(queue, now)
-        self._live.drop_outdated(self._queues.values(), now)
-        self._forget_drained()
-        if self._full_since is not None and 2 * self._tally.bytes < self._limits.size:
-            count = self._tally.dropped_as_full() - self._full_since
-            self._full_since = None
-            log.warning(
-                "the backlog of %s has room again; %d messages were dropped or refused",
-                self._name,
-                count,
-            )
-
-    def _drop_outdated(self, queue: RuleQueue, now: float) -> None:
-        """Drop what is too old or expired, from the front of the queue."""
-        while True:
-            queue.skip_gone()
-            if queue.again:
-                record = queue.again[0].record
-                reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
-            elif queue.waiting:
-                reason = self._why(queue.waiting[0], now)
-            else:
-                segment = queue.unread() if queue.behind else None
-                age = self._limits.age
-                if segment is None or age is None or segment.last_at + age > now:
-                    break
-                reason = DropReason.AGE
-            if reason is None:
-                break
-            self._drop_first_stored(queue, reason)
-        while queue.live and (reason := self._why(queue.live[0], now)):
-            data = self._live.pop(queue)
-            self._tally.remove(queue, len(data))
-            self._tally.drop(queue, reason)
-
-    def _why(self, data: bytes, now: float) -> DropReason | None:
-        """Why an encoded record is not to be sent any more, if so."""
-        _, stored_at, expires_at = record_times(data)
-        return too_old(stored_at, expires_at, self._limits.age, now)
+        self._eviction.drop_outdated(now)
+        self._live.drop_outdated(self._queues.by_name.values(), now)
+        if self._queues.forget_drained():
+            self._sort()
+        self._eviction.say_room()
 
     # --- out --------------------------------------------------------------------------------------
 
     def connected(self, packet_size: float = math.inf) -> None:
         """A connection can be sent messages from now on, of at most that size."""
         self._online = True
-        held = self._queues.get(HELD)
+        held = self._queues.by_name.get(HELD)
         if held is not None:
             self._end_passes(held)
             more = packet_size > self._held_at
@@ -742,14 +471,14 @@ class Backlog:
                 return None
             only_again = size >= IN_FLIGHT_SIZE + IN_FLIGHT_RESERVE
         most_later = MOST_LATER
-        if only_again and size - self._later_size < IN_FLIGHT_RESERVE:
+        if only_again and size - self._retries.size < IN_FLIGHT_RESERVE:
             only_again, most_later = False, 1  # only what was refused fills the memory
         bucket, byte_bucket = self._bucket, self._byte_bucket
         if bucket is not None and bucket.due(now) > now:
             return None
         if byte_bucket is not None and byte_bucket.due(now) > now:
             return None
-        if self._later_count:
+        if self._retries.count:
             entry = self._next_later(now)
             if entry is not None:
                 return entry
@@ -821,8 +550,7 @@ class Backlog:
         if not entries:
             entry_of_next = self.next(now)
             return [] if entry_of_next is None else [entry_of_next]
-        if self._oversized is queue:
-            self._oversized = None
+        self._read_ahead.has_taken(queue)
         self._live_first[lane] = True
         self._note_passed(lane, len(entries))
         return entries
@@ -832,12 +560,12 @@ class Backlog:
         if (
             self._bucket is not None
             or self._byte_bucket is not None
-            or self._later_count
+            or self._retries.count
             or self._repeated
         ):
             return None, 0
         found: RuleQueue | None = None
-        for lane, queues in enumerate(self._lanes):
+        for lane, queues in enumerate(self._queues.lanes):
             for queue in queues:
                 if not queue.passes:
                     continue  # of what waits here nothing may be sent
@@ -863,7 +591,7 @@ class Backlog:
             or found.live
             or found.bucket is not None
             or found.name == HELD
-            or (found.behind and found.reading is None and 2 * found.loaded <= self._share)
+            or self._read_ahead.is_due(found)
         ):
             return None, 0
         return found, most
@@ -884,7 +612,7 @@ class Backlog:
             stored: RuleQueue | None = None
             live: RuleQueue | None = None
             live_number = 0
-            for queue in self._lanes[lane]:
+            for queue in self._queues.lanes[lane]:
                 if not queue.messages or not queue.passes:
                     continue
                 bucket = queue.bucket
@@ -896,8 +624,8 @@ class Backlog:
                 is_refused = queue.later >= most_later
                 if (only_again or is_refused) and not again:
                     continue
-                if queue.behind and queue.reading is None and 2 * queue.loaded <= self._share:
-                    self._read_on(queue, now)
+                if queue.behind and self._read_ahead.is_due(queue):
+                    self._read_ahead.read(queue, now)
                 if latest.blocked:
                     latest.unblock(queue.first_number_stored())
                 if latest.ready and next(iter(latest.ready.values())).data is None:
@@ -950,7 +678,7 @@ class Backlog:
             queue.held_up_by = value
             self._live.read(queue, value, now)
             return None
-        data, part, index = self._pop_waiting(queue)
+        data, part, index = self._read_ahead.pop(queue)
         try:
             record = self._decoder.decode(data)
             reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
@@ -973,8 +701,8 @@ class Backlog:
         entry = Entry(queue, record, len(data))
         entry.part = part
         entry.index = index
-        if queue.name == HELD and record.rule in self._queues:
-            entry.qos = self._queues[record.rule].qos
+        if queue.name == HELD and record.rule in self._queues.by_name:
+            entry.qos = self._queues.by_name[record.rule].qos
         return self._hand_out(entry, now)
 
     def _take_live(self, queue: RuleQueue, now: float) -> Entry | None:
@@ -983,7 +711,7 @@ class Backlog:
                 return self._take_latest(queue, value, now)
             break
         data = self._live.pop(queue)
-        reason = self._why(data, now)
+        reason = self._eviction.why(data, now)
         if reason is not None:
             self._tally.remove(queue, len(data))
             self._tally.drop(queue, reason)
@@ -1038,12 +766,7 @@ class Backlog:
 
     def _next_later(self, now: float) -> Entry | None:
         """A message that is to be tried again now."""
-        later = self._later
-        while later and (later[0][0] <= now or later[0][2].state != LATER):
-            entry = heapq.heappop(later)[2]
-            if entry.state != LATER:
-                continue
-            self._count_later(entry, -1)
+        while (entry := self._retries.pop(now)) is not None:
             record = entry.record
             reason = too_old(record.stored_at, record.expires_at, self._limits.age, now)
             if reason is None:
@@ -1061,52 +784,13 @@ class Backlog:
         blocked = max(times, default=now)
         if blocked > now:
             return blocked if self._tally.messages > len(self._flying) else None
-        while self._later and self._later[0][2].state != LATER:
-            heapq.heappop(self._later)
-        times = [due for due, _, _ in self._later[:1]]
-        for queue in self._queues.values():
+        retry_at = self._retries.due()
+        times = [] if retry_at is None else [retry_at]
+        for queue in self._queues.by_name.values():
             times += (queue.read_at, queue.values_at)
             if queue.bucket is not None and queue.messages:
                 times.append(queue.bucket.due(now))
         return min((due for due in times if due > now), default=None)
-
-    # --- reading ----------------------------------------------------------------------------------
-
-    def _read_on(self, queue: RuleQueue, now: float) -> None:
-        """Read the next segment of a rule's journal, if there is memory for it."""
-        if queue.read_failed:
-            queue.read_failed = False
-            queue.read_at = now + READ_AGAIN
-        if queue.read_at > now:
-            return
-        if queue.has_large_next and (queue.waiting or not self._may_exceed()):
-            return
-        segment = queue.unread()
-        if segment is None:
-            queue.behind = False
-            return
-        if segment.size > self._share and segment.count == 1 and not self._may_exceed():
-            return
-        queue.start_reading(segment)
-        assert queue.journal is not None
-        queue.journal.read(segment, partial(self._was_read, queue, segment))
-
-    def _was_read(
-        self, queue: RuleQueue, segment: Segment, outcome: list[bytes] | Exception
-    ) -> None:
-        if queue.reading is not segment:
-            return  # it was dropped meanwhile
-        arrived = queue.stop_reading()
-        if isinstance(outcome, RecordsLostError):
-            self._drop_unread(queue, segment, DropReason.UNREADABLE)
-        elif isinstance(outcome, Exception):
-            if not queue.read_at:
-                log.warning("backlog of %s: cannot be read: %s", self._name, outcome)
-            queue.read_failed = True
-        else:
-            queue.read_at = 0.0
-            self._keep_read(queue, segment, outcome, arrived)
-        self._wake_up()
 
     def _wake_up(self) -> None:
         """`next` may have something again."""
@@ -1114,35 +798,9 @@ class Backlog:
             self._idle = False
             self._wake()
 
-    def _keep_read(
-        self,
-        queue: RuleQueue,
-        segment: Segment,
-        records: list[bytes],
-        arrived: list[tuple[Segment, int, bytes]],
-    ) -> None:
-        """Keep of a segment what the memory allows, and what was appended while it was read."""
-        first, underestimated = queue.begin(segment, records)
-        self._tally.add(queue, 0, underestimated)
-        if not queue.keep_rest(segment, records, first, self._share):
-            for kept, data in enumerate(records[first:]):
-                if not self._has_memory(queue, len(data)):
-                    queue.has_large_next = not kept
-                    return
-                queue.keep(segment, data)
-        for place, index, data in arrived:
-            if place is segment and index < len(records):
-                continue
-            if not self._has_memory(queue, len(data)):
-                return
-            queue.keep(place, data)
-        queue.behind = queue.unread() is not None
-
-    def _pop_waiting(self, queue: RuleQueue) -> tuple[bytes, HeldSegment, int]:
-        popped = queue.pop_waiting()
-        if self._oversized is queue:
-            self._oversized = None
-        return popped
+    def _lost(self, queue: RuleQueue, segment: Segment) -> None:
+        """A segment is damaged on the disk."""
+        self._eviction.drop_unread(queue, segment, DropReason.UNREADABLE)
 
     # --- what becomes of it -----------------------------------------------------------------------
 
@@ -1216,16 +874,7 @@ class Backlog:
             queue.settle(entry.part, entry.index)
             entry.part = None
             self._check_emptied(queue)
-        entry.state = LATER
-        self._count_later(entry, 1)
-        delay = min(LONGEST_RETRY, FIRST_RETRY * 2 ** min(entry.attempts - 1, 10))
-        heapq.heappush(self._later, (now + delay, entry.record.number, entry))
-
-    def _count_later(self, entry: Entry, count: int) -> None:
-        """One more is to be tried again at a time, or one less."""
-        self._later_count += count
-        self._later_size += count * (entry.size + ENTRY_OVERHEAD)
-        entry.queue.later += count
+        self._retries.add(entry, now)
 
     def hold(self, entry: Entry, packet_size: int, now: float) -> bool:
         """The fleet's broker takes only smaller packets now: keep it until one takes more than
@@ -1237,7 +886,7 @@ class Backlog:
         """
         if entry.topic is not None or (entry.part is None and entry.key is None):
             return False
-        held = self._orphaned(HELD)
+        held = self._queues.orphaned(HELD)
         if entry.queue is not held and (
             held.messages >= MOST_HELD or held.bytes + entry.size > self._limits.size * HELD_SHARE
         ):
@@ -1274,7 +923,7 @@ class Backlog:
         What is only for a connection is forgotten.
         """
         self._online = False
-        held = self._queues.get(HELD)
+        held = self._queues.by_name.get(HELD)
         if held is not None:
             self._end_passes(held)
         flying = list(self._flying.values())
@@ -1283,14 +932,12 @@ class Backlog:
         for entry in reversed(flying):
             self._again_size += entry.size + ENTRY_OVERHEAD
             self._put_back(entry)
-        for _, _, entry in self._later:
-            if entry.state == LATER and not _is_kept(entry):
+        for entry in list(self._retries):
+            if not _is_kept(entry):
                 self._discard(entry, DropReason.OFFLINE)
-        for queue in self._queues.values():
+        for queue in self._queues.by_name.values():
             while queue.live:
-                data = self._live.pop(queue)
-                self._tally.remove(queue, len(data))
-                self._tally.drop(queue, DropReason.OFFLINE)
+                self._eviction.drop_first_live(queue, DropReason.OFFLINE)
 
     def _put_back(self, entry: Entry) -> None:
         """It is not in flight any more, and is sent again before all others of its rule."""
@@ -1335,7 +982,7 @@ class Backlog:
     def _discard(self, entry: Entry, reason: DropReason) -> None:
         """Drop an entry that is not in flight."""
         if entry.state == LATER:
-            self._count_later(entry, -1)
+            self._retries.remove(entry)
         self._again_size -= entry.size + ENTRY_OVERHEAD
         self._tally.drop(entry.queue, reason)
         self._end(entry)
@@ -1349,13 +996,14 @@ class Backlog:
     def counts(self) -> BacklogCounts:
         """What waits now, and what has happened since the start; a copy."""
         counts = self._tally
+        held = self._queues.by_name.get(HELD)
         oldest: list[float] = [entry.record.stored_at for entry in self._flying.values()]
-        oldest += [entry.record.stored_at for _, _, entry in self._later if entry.state == LATER]
-        for queue in self._queues.values():
+        oldest += [entry.record.stored_at for entry in self._retries]
+        for queue in self._queues.by_name.values():
             for at in (queue.oldest_stored(), queue.oldest_live()):
                 if at is not None:
                     oldest.append(at)
-        lanes = [sum(queue.messages for queue in queues) for queues in self._lanes]
+        lanes = [sum(queue.messages for queue in queues) for queues in self._queues.lanes]
         return BacklogCounts(
             counts.offered,
             counts.restored,
@@ -1368,7 +1016,7 @@ class Backlog:
             (lanes[0], lanes[1], lanes[2]),
             min(oldest, default=None),
             len(self._aside),
-            self._queues[HELD].messages if HELD in self._queues else 0,
+            0 if held is None else held.messages,
         )
 
     def aside(self) -> list[SetAside]:
@@ -1379,10 +1027,3 @@ class Backlog:
 def _is_kept(entry: Entry) -> bool:
     """Whether the message outlives the connection."""
     return entry.topic is not None or entry.part is not None or entry.key is not None
-
-
-def _bucket(bucket: TokenBucket | None, rate: float | None, now: float) -> TokenBucket | None:
-    """The bucket of a rate: the same one if the rate has not changed."""
-    if rate is None or (bucket is not None and bucket.rate == rate):
-        return None if rate is None else bucket
-    return TokenBucket(rate, now)

@@ -11,7 +11,7 @@ import pytest
 from appliance.broker.backlogs import RecordsLostError
 from appliance.mqtt.codec import NO_PROPERTIES
 from appliance.upstream import backlog as module
-from appliance.upstream import live_messages
+from appliance.upstream import live_messages, read_ahead
 from appliance.upstream.backlog import (
     MOST_LATER,
     Backlog,
@@ -476,8 +476,8 @@ def test_what_is_on_the_way_into_memory_is_not_merged_on_the_disk(
 
         batch(3)
         size = link.counts().bytes // 3 + LOADED_OVERHEAD
-        monkeypatch.setattr(module, "LOADED_SIZE", room * size)
-        monkeypatch.setattr(module, "LOADED_SHARE", 0)
+        monkeypatch.setattr(read_ahead, "LOADED_SIZE", room * size)
+        monkeypatch.setattr(read_ahead, "LOADED_SHARE", 0)
         link.restart()
         assert link.backlog.next(link.backlogs.time) is None and link.backlogs.rounds  # it is read
         for _ in range(during):
@@ -503,8 +503,8 @@ def test_the_rest_of_a_segment_is_damaged_of_which_a_part_is_in_memory(
         if number in (9, 9 + more):
             link.backlogs.commit()
     size = link.counts().bytes // (10 + more) + LOADED_OVERHEAD
-    monkeypatch.setattr(module, "LOADED_SIZE", room * size)
-    monkeypatch.setattr(module, "LOADED_SHARE", 0)
+    monkeypatch.setattr(read_ahead, "LOADED_SIZE", room * size)
+    monkeypatch.setattr(read_ahead, "LOADED_SHARE", 0)
     link.restart()
     assert link.backlog.next(link.backlogs.time) is None
     link.backlogs.turn()
@@ -1050,6 +1050,25 @@ def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no
         again = link.next()
         assert again is not None and link.next() is None
         link.backlog.rewind()
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_what_is_held_is_the_first_to_be_dropped(restarts: bool) -> None:
+    """Of a rule of normal priority: what cannot be sent now goes before what can."""
+    link = Link(size=4000)
+    waiting = ["y" * 600] * 6
+    link.offer(waiting[0])
+    link.offer("x" * 500)
+    _, entry = link.take(2)
+    assert link.backlog.hold(entry, 10, link.backlogs.time)
+    link.backlog.rewind()
+    link.backlogs.commit()
+    if restarts:
+        link.restart()
+    for payload in waiting[1:]:
+        link.offer(payload)
+    assert link.counts().held == 0 and link.dropped() == {"full": 1}
+    assert link.drain() == waiting
 
 
 def test_many_at_once_leave_out_what_was_replaced_or_is_held() -> None:

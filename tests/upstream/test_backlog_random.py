@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import pytest
 
 from appliance.upstream import backlog as module
-from appliance.upstream import live_messages
+from appliance.upstream import live_messages, read_ahead
 from appliance.upstream.backlog_counts import DropReason
-from appliance.upstream.rule_queue import ENTRY_OVERHEAD, GONE, LATER, Entry
+from appliance.upstream.rule_queue import ENTRY_OVERHEAD, GONE, Entry
 from appliance.upstream.rules import OutRule
 from upstream.plain_backlogs import PlainBacklogs
 from upstream.test_backlog import Link, rule
@@ -142,7 +142,7 @@ class Twin:
                     del self.later[entry]
                     self.expect(of, DropReason.REPLACED)
             waiting.latest[topic] = sent
-            value = self.link.backlog._queues[self.rules[of].local_filter].latest.get(topic)
+            value = self.link.backlog._queues.by_name[self.rules[of].local_filter].latest.get(topic)
             assert value is not None and (value.key is not None or not sent.is_stored)
             sent.is_stored = value.key is not None  # also where memory has no room for it
             self.on_disk += value.single is not None
@@ -345,7 +345,7 @@ class Twin:
     def outdated(self, of: int) -> Sent | None:
         """One that has expired: a latest one that is not there any more, or one at a front."""
         queue = self.waiting[of]
-        there = self.link.backlog._queues[self.rules[of].local_filter].latest
+        there = self.link.backlog._queues.by_name[self.rules[of].local_filter].latest
         found = [each for topic, each in queue.latest.items() if topic not in there]
         found += [each for entry, each in self.later.items() if entry.state == GONE]
         found += (queue.again or queue.all)[:1] + queue.live[:1]
@@ -423,8 +423,8 @@ OPERATIONS += ["connect", "connect", "wait", "retry", "aside", "restart", "resta
 @pytest.fixture
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most of what waits is only on disk."""
-    monkeypatch.setattr(module, "LOADED_SIZE", 1500)
-    monkeypatch.setattr(module, "LOADED_SHARE", 300)
+    monkeypatch.setattr(read_ahead, "LOADED_SIZE", 1500)
+    monkeypatch.setattr(read_ahead, "LOADED_SHARE", 300)
     monkeypatch.setattr(live_messages, "LATEST_SIZE", 1200)
     monkeypatch.setattr(live_messages, "VALUES_SIZE", 300)
 
@@ -459,6 +459,7 @@ def test_like_a_full_list(seed: int) -> None:
 def test_like_a_list_of_which_much_is_refused(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A rule with many that are to be tried again waits, and no other does."""
     monkeypatch.setattr(module, "MOST_LATER", 2)
+    monkeypatch.setattr(read_ahead, "MOST_LATER", 2)
     _compare(Twin(seed, MIXED), seed, OPERATIONS + ["retry"] * 8)
 
 
@@ -606,13 +607,13 @@ class Pair:
         ]
         assert stored[0] == stored[1]
         for each in (link.backlog for link in self.links):
-            again = [entry for queue in each._queues.values() for entry in queue.again]
-            again += [entry for _, _, entry in each._later if entry.state == LATER]
+            again = [entry for queue in each._queues.by_name.values() for entry in queue.again]
+            again += list(each._retries)
             waiting = [entry.size + ENTRY_OVERHEAD for entry in again if entry.state != GONE]
             assert each._again_size == sum(waiting)
-            later = [entry for _, _, entry in each._later if entry.state == LATER]
-            assert each._later_size == sum(entry.size + ENTRY_OVERHEAD for entry in later)
-            assert sum(queue.later for queue in each._queues.values()) == len(later)
+            later = list(each._retries)
+            assert each._retries.size == sum(entry.size + ENTRY_OVERHEAD for entry in later)
+            assert sum(queue.later for queue in each._queues.by_name.values()) == len(later)
         sizes = [
             (each._flying_size, each._again_size, each._live.memory)
             for each in (link.backlog for link in self.links)
