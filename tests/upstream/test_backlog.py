@@ -1055,10 +1055,10 @@ def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no
 @pytest.mark.parametrize("restarts", [False, True])
 def test_what_is_held_is_the_first_to_be_dropped(restarts: bool) -> None:
     """Of a rule of normal priority: what cannot be sent now goes before what can."""
-    link = Link(size=4000)
+    link = Link(rule("a"), rule("b"), size=4000)
     waiting = ["y" * 600] * 6
     link.offer(waiting[0])
-    link.offer("x" * 500)
+    link.offer("x" * 500, of=1)
     _, entry = link.take(2)
     assert link.backlog.hold(entry, 10, link.backlogs.time)
     link.backlog.rewind()
