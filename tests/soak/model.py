@@ -250,9 +250,8 @@ class Model:
         grant = Grant(qos, self.clock())
         is_new = not any(older.gone_at == inf for older in coverage.grants)
         if retain_handling == 0 or (retain_handling == 1 and not coverage.held):
-            replay = session.replays.setdefault(topic_filter, Replay(0, 0.0))
-            replay.count += 1
-            replay.sent_at = grant.sent_at
+            grant.replay = session.replays.setdefault(topic_filter, Replay())
+            grant.replay.count += 1
         if retain_handling == 0 or (retain_handling == 1 and is_new):
             grant.retained = self._expected_retained(coverage, qos)
         coverage.grants.append(grant)
@@ -280,6 +279,8 @@ class Model:
         """SUBACK granted it: what was there before under the filter is replaced."""
         now = self.clock()
         coverage = session.coverages[topic_filter]
+        if grant.replay is not None:
+            grant.replay.sent_at = max(grant.replay.sent_at, grant.sent_at)
         for older in coverage.grants:
             if older is not grant and older.sent_at <= grant.sent_at:
                 older.gone_at = min(older.gone_at, now)
@@ -467,7 +468,8 @@ class Model:
         elif not asked:
             text = f"{session} received it as retained, and had not asked for it"
             self.violation("not subscribed", text, message, session)
-        elif max(replay.sent_at for replay in asked) > message.superseded_at:
+        # What is sent again was sent for a SUBSCRIBE of an earlier connection.
+        elif not packet.dup and max(replay.sent_at for replay in asked) > message.superseded_at:
             text = f"{session} received it as retained after it had been replaced"
             self.violation("stale", text, message, session)
         elif session.replayed[message] > sum(replay.count for replay in asked):

@@ -59,6 +59,8 @@ class Grant:
     given_up: bool = False
     #: What was certainly retained when it was sent, and is to come.
     retained: list[Message] = field(default_factory=list)
+    #: What it asks for, if it asks for retained messages.
+    replay: Replay | None = None
 
 
 @dataclass(eq=False, slots=True)
@@ -84,8 +86,10 @@ class Coverage:
 class Replay:
     """The SUBSCRIBEs under one filter that ask for retained messages."""
 
-    count: int
-    sent_at: float
+    count: int = 0
+    #: When the last one was sent that the broker has answered. Before its answer what comes may
+    #: have been sent for an earlier one.
+    sent_at: float = 0.0
 
 
 @dataclass(slots=True)

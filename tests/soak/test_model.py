@@ -271,6 +271,23 @@ def test_retained_messages_come_with_the_subscription(model: Model) -> None:
     assert kinds(model)[-1] == "lost retained"
 
 
+def test_a_retained_message_is_stale_only_if_no_earlier_subscribe_can_have_asked(
+    model: Model,
+) -> None:
+    old = publish(model, "t/a", 1, retain=True)
+    session = model.begin("sub", ALL)
+    subscribe(model, session, "t/a", 1)
+    new = publish(model, "t/a", 1, retain=True)
+    again = model.subscribing(session, Subscription("t/a", 1))
+    deliver(model, session, old, 1, retain=True)  # it was on its way
+    model.subscribed(session, "t/a", again)
+    deliver(model, session, old, 1, dup=True, retain=True)  # sent again to another connection
+    assert kinds(model) == []
+    deliver(model, session, old, 1, retain=True)
+    assert kinds(model) == ["stale"]
+    deliver(model, session, new, 1, retain=True)
+
+
 def test_a_shared_subscription_is_owed_each_message_once(model: Model) -> None:
     members = [model.begin(name, ALL) for name in ("one", "two")]
     for session in members:
