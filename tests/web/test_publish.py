@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
+import cbor2
 import pytest
 from appliance_process import ROBOT, ApplianceProcess
 from interop.paho_peer import V5, Peer
+from ros_domain import DOMAIN
+from ros_domain import isolated_domain as isolated_domain
 from visits import DESKTOP, PHONE, Visit
-from waiting import eventually
+from waiting import PATIENCE, eventually
 
 pytest.importorskip("rclpy")
 pytest.importorskip("playwright.sync_api")
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import CompressedImage, LaserScan
+from std_msgs.msg import Int64MultiArray
 
 BIG = 2**53 + 1
 BATTERY = f"{ROBOT}/battery"
@@ -27,6 +37,25 @@ def bridge(bridge: dict[str, Any]) -> dict[str, Any]:
             *bridge["topics"],
             {"ros": "/big", "to": "ros", "type": "std_msgs/msg/Int64"},
             {"ros": "/battery", "to": "ros", "type": "sensor_msgs/msg/BatteryState"},
+            {
+                "ros": "/tensor",
+                "to": "ros",
+                "type": "std_msgs/msg/Int64MultiArray",
+                "encoding": "cbor",
+            },
+            {
+                "ros": "/photo",
+                "to": "ros",
+                "type": "sensor_msgs/msg/CompressedImage",
+                "encoding": "cbor",
+                "compression": "zstd",
+            },
+            {
+                "ros": "/laser",
+                "to": "ros",
+                "type": "sensor_msgs/msg/LaserScan",
+                "encoding": "cbor",
+            },
             {"ros": "/nothing", "to": "mqtt", "type": "acme_msgs/msg/Nothing"},
         ],
     }
@@ -43,7 +72,7 @@ def opened(visited: Visit, topic: str, user: str = "alice") -> Any:
     page = visited.sign_in(user, "Publish")
     page.wait_for_selector(f"option[value='{topic}']", state="attached")
     page.select_option("select", topic)
-    page.wait_for_selector(".publish .field")
+    page.wait_for_selector(".publish .both")
     return page
 
 
@@ -130,6 +159,85 @@ def test_large_integers_arrive_exact(
         assert message.properties.ContentType == "application/json"
         page.fill("#field-data", "9223372036854775808")
         page.wait_for_selector("#field-data-error:has-text('not within')")
+
+
+class Listener:
+    """A node that hears what comes on topics of ROS; their types by their names."""
+
+    def __init__(self, **types: Any) -> None:
+        self._context = rclpy.Context()
+        self._context.init(domain_id=int(DOMAIN))
+        self._node = rclpy.create_node("listener", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._heard: list[tuple[str, Any]] = []
+        for name, kind in types.items():
+            self._node.create_subscription(kind, f"/{name}", partial(self._hear, name), 10)
+
+    def _hear(self, name: str, message: Any) -> None:
+        self._heard.append((name, message))
+
+    def hears(self, expected: str) -> Any:
+        """The next message, which is of this topic."""
+        deadline = time.monotonic() + PATIENCE
+        while not self._heard and time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.1)
+        name, message = self._heard.pop(0)
+        assert name == expected
+        return message
+
+    def stop(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.shutdown()
+
+
+@pytest.fixture
+def listener(appliance: ApplianceProcess, isolated_domain: None) -> Iterator[Listener]:
+    listener = Listener(tensor=Int64MultiArray, photo=CompressedImage, laser=LaserScan)
+    yield listener
+    listener.stop()
+
+
+def test_a_form_is_sent_as_cbor(
+    visit: Callable[..., Visit], appliance: ApplianceProcess, listener: Listener
+) -> None:
+    """Journey 5 on routes in CBOR: ROS gets 2^53 + 1, floats and bytes as they were entered."""
+    visited = visit(**DESKTOP)
+    page = opened(visited, f"{ROBOT}/tensor")
+    with Peer(appliance, V5) as peer:
+        peer.subscribe(f"{ROBOT}/tensor")
+        page.fill(".publish textarea", f'{{"data": [0, {-BIG}], "layout": {{"data_offset": 7}}}}')
+        page.click("summary:has(bdi:text-is('data'))")
+        page.fill("[id='field-data%5B0%5D']", str(BIG))
+        send(page, "0x00")
+        heard = listener.hears("tensor")
+        assert list(heard.data) == [BIG, -BIG] and heard.layout.data_offset == 7
+        message = peer.message()
+        assert message.properties.ContentType == "application/cbor"
+        assert cbor2.loads(message.payload)["data"].tag == 79  # little endian, 64 bits
+        visited.look("desktop-publish-5-cbor")
+        page.select_option("select", f"{ROBOT}/photo")
+        page.wait_for_selector("#field-format")
+        page.fill("#field-format", "jpeg; ü")
+        page.click("summary:has-text('header')")
+        page.click("summary:has-text('stamp')")
+        page.check("text='now, when the robot gets it'")
+        page.fill("#field-data", "AP8=")
+        send(page, "0x00")
+        photo = listener.hears("photo")
+        assert bytes(photo.data) == b"\x00\xff" and photo.format == "jpeg; ü"
+        assert photo.header.stamp.sec > 0
+        page.select_option("select", f"{ROBOT}/laser")
+        page.wait_for_selector("#field-range_max")
+        page.fill(".publish textarea", '{"range_max": 12, "ranges": [1, 0.5, null, 1e300]}')
+        send(page, "0x99")  # what no schema forbids, and float32 does
+        page.wait_for_selector(".warnings:has-text('ranges[3]')")
+        page.fill(".publish textarea", '{"range_max": 12, "ranges": [1, 0.5, null]}')
+        send(page, "0x00")
+        scan = listener.hears("laser")
+        assert scan.range_max == 12.0 and list(scan.ranges[:2]) == [1.0, 0.5]
+        assert math.isnan(scan.ranges[2])
 
 
 def test_a_viewer_may_not(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:

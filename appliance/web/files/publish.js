@@ -13,7 +13,9 @@ const html = htm.bind(h)
 const LARGEST = 1024 * 1024 // characters of a payload
 const CHOICES = 500 // routes to choose from
 
-const FORMATS = { json: 'application/json', text: 'text/plain', base64: '' }
+const FORMATS = { json: 'application/json', cbor: 'application/cbor', text: 'text/plain', base64: '' }
+const WRITTEN = { json: 'JSON', cbor: 'JSON, sent as CBOR', text: 'Text', base64: 'Base64' }
+const isJson = (format) => format === 'json' || format === 'cbor'
 
 const ANSWERS = {
   0x00: 'Accepted', 0x10: 'Accepted; nobody has subscribed to this topic', 0x80: 'Unspecified error', 0x83: 'Implementation specific error',
@@ -48,13 +50,13 @@ export default function Publish({ topic }) {
     ${topic && html`<${Message} key=${topic} topic=${topic} route=${routes.find(({ mqtt }) => mqtt === topic)} />`}`
 }
 
-/** How a route's payload is written here: JSON, text, or bytes as base64. */
+/** How a route's payload is written here: JSON (which `cbor` is made of), text, or bytes as base64. */
 function formatOf({ encoding }) {
-  return ['json', 'text'].includes(encoding) ? encoding : 'base64'
+  return ['json', 'cbor', 'text'].includes(encoding) ? encoding : 'base64'
 }
 
 function Message({ topic, route }) {
-  const schemaTopic = route?.encoding === 'json' ? schemaOf(route, '') : null
+  const schemaTopic = route && isJson(formatOf(route)) ? schemaOf(route, '') : null
   const told = useShelf(schemaTopic ? [[schemaTopic, 1]] : [])
   const schema = schemaTopic ? told.topics.get(schemaTopic) : undefined
   const line = lack(useRights([topic]), topic)
@@ -63,8 +65,8 @@ function Message({ topic, route }) {
   const [text, setText] = useState(null)
   const [answer, setAnswer] = useState(null)
   const [isBusy, setBusy] = useState(false)
-  const payload = text ?? (format === 'json' ? '{}' : '')
-  const message = useMessage(payload, schema, answer?.refused, format === 'json')
+  const payload = text ?? (isJson(format) ? '{}' : '')
+  const message = useMessage(payload, schema, answer?.refused, isJson(format))
   const edit = (next) => {
     setText(next)
     setAnswer(null)
@@ -75,7 +77,7 @@ function Message({ topic, route }) {
     if (!mayBeSent(message, answer?.refused, form)) return
     setBusy(true)
     try {
-      setAnswer(await publish(topic, route, format, payload, form.elements))
+      setAnswer(await publish(topic, route, format, await payloadOf(format, payload, message), form.elements))
     } catch (error) {
       setAnswer({ words: error.message, isBad: true })
     }
@@ -85,8 +87,8 @@ function Message({ topic, route }) {
     <h2><bdi>${topic.slice(0, 200)}</bdi></h2>
     <${About} route=${route} format=${format} schema=${schema} root=${message.root} refused=${told.refused} />
     ${!route && html`<label>Format <select value=${chosen} onChange=${(event) => { setFormat(event.currentTarget.value); edit(null) }}>
-      <option value="json">JSON</option><option value="text">Text</option><option value="base64">Bytes, as base64</option></select></label>`}
-    <${Editor} label=${format === 'json' ? 'JSON' : format === 'text' ? 'Text' : 'Base64'} text=${payload} message=${message}
+      <option value="json">JSON</option><option value="cbor">CBOR, from JSON</option><option value="text">Text</option><option value="base64">Bytes, as base64</option></select></label>`}
+    <${Editor} label=${WRITTEN[format]} text=${payload} message=${message}
       most=${LARGEST} edit=${edit} />
     <${Options} />
     <${Lacking} line=${line} what="publish here" />
@@ -101,7 +103,8 @@ function About({ route, format, schema, root, refused }) {
   return html`<p class="quiet">${route.direction === 'to_ros' ? 'To' : 'From'} ROS: <bdi>${route.ros}</bdi>, <bdi>${route.type}</bdi>${
     format === 'base64' ? `, in ${route.encoding}: bytes are given as base64` : ''}.
     ${route.rules?.commanding && html` Commanding now: <strong><bdi>${route.rules.commanding}</bdi></strong>.`}</p>
-    ${refused.length > 0 && html`<p class="notice">Without its schema there is no form. The access rules would need the line:
+    ${refused.length > 0 && html`<p class="notice">Without its schema there is no form${
+      format === 'cbor' ? ', and bytes go as base64' : ''}. The access rules would need the line:
       <code>topic read ${refused[0]}</code></p>`}
     ${schema && root === null && html`<p class="notice">The schema cannot be used: there is no form.</p>`}`
 }
@@ -124,13 +127,21 @@ async function publish(topic, route, format, payload, { qos, retain, expiry }) {
   // A single command might be an old one, for a route that minds: this says that it is not.
   if (route?.rules) properties.userProperties = { 'sent-at': (Date.now() / 1000).toFixed(3) }
   const level = Number(qos.value)
-  const values = { topic, payload: format === 'base64' ? bytesOf(payload) : payload, qos: level, retain: retain.checked, properties }
+  const values = { topic, payload, qos: level, retain: retain.checked, properties }
   const { code, words } = await ask('publish', values)
   if (level === 0) return { words: 'Sent. With QoS 0 nobody answers.' }
   const name = `0x${code.toString(16).padStart(2, '0')} ${ANSWERS[code] ?? ''}`.trim()
   const isBad = code >= 0x80
   const field = isBad && /(?:cannot be converted|was refused): ([^:\s]+): (.*)$/s.exec(words)
   return { words: words ? `${name}: ${words}` : `${name}.`, isBad, refused: field ? { path: field[1], words: field[2] } : null }
+}
+
+/** What is sent for the text. CBOR is made when it is needed; a schema tells it bytes from text. */
+async function payloadOf(format, text, { root, value }) {
+  if (format === 'base64') return bytesOf(text)
+  if (format !== 'cbor') return text
+  const { encode } = await import('./cbor.js')
+  return encode(root, value)
 }
 
 function bytesOf(text) {
