@@ -5,7 +5,7 @@ from __future__ import annotations
 from appliance.access.acl import Acl, ActionVerdict, Explanation
 from appliance.access.files import Changes, FileAccess, Rules
 from appliance.access.login import LoginPlugins, LoginPolicy, no_user
-from appliance.access.passwords import Passwords, check_password, check_username
+from appliance.access.passwords import Passwords, check_hash, check_password, check_username
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.rules import Permission, Rule
 from appliance.access.tokens import LIFETIME as TOKEN_LIFETIME
@@ -28,6 +28,7 @@ __all__ = [
     "Refusal",
     "Rule",
     "Rules",
+    "check_hash",
     "check_password",
     "check_username",
     "is_token",

@@ -281,7 +281,7 @@ def _parse(path: Path, text: str) -> dict[str, str]:
             continue
         lines[username] = number
         try:
-            _check_hash(stored, username)
+            check_hash(stored, username)
         except ValueError as error:
             problems.append(FileProblem(path, number, len(username) + 2, str(error)))
         else:
@@ -299,7 +299,7 @@ def _entry(line: str) -> tuple[str, str, str] | None:
     return line.partition(":")
 
 
-def _check_hash(stored: str, username: str) -> None:
+def check_hash(stored: str, username: str) -> None:
     """Raise a ValueError that says why the hash is not supported, without showing it."""
     advice = f"set a password with: appliance user passwd {username}"
     argon2id = _ARGON2ID.fullmatch(stored)

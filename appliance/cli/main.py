@@ -21,6 +21,7 @@ from appliance.cli.console import CommandError
 from appliance.cli.doctor import doctor
 from appliance.cli.enrol import user_enrol
 from appliance.cli.fastdds import fastdds
+from appliance.cli.import_mosquitto import import_mosquitto
 from appliance.cli.install import install, uninstall
 from appliance.cli.log import log
 from appliance.cli.routes import routes
@@ -42,6 +43,7 @@ LOOKING = (status, top, doctor, log, routes, upstream)
 USING = (pub, sub, call, goal)
 for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)
+app.command("import")(import_mosquitto)
 user_app.command("enrol")(user_enrol)
 GROUPS = {
     "clients": clients_app,

@@ -217,7 +217,7 @@ def initialise(
     file = directory / "appliance.yaml"
     name = robot_name(robot or ("demo" if demo else socket.gethostname().partition(".")[0]))
     text = (DEMO_CONFIGURATION if demo else configuration).format(robot=name)
-    made = _write_new(file, text)
+    made = write_new(file, text)
     settings = config.load(file)
     if robot and not made and settings.robot != name:
         raise InitError(f"{file} has robot: {settings.robot}; change it there")
@@ -282,8 +282,8 @@ def _write_rules(path: Path, rules: str, calls: str) -> bool:
     if path.exists():
         return False
     for name, text in GROUPS.items():
-        _write_new(path.parent / "groups" / name, text.format(calls=calls))
-    return _write_new(path, rules)
+        write_new(path.parent / "groups" / name, text.format(calls=calls))
+    return write_new(path, rules)
 
 
 def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Iterator[InitStep]:
@@ -338,7 +338,7 @@ def _link(settings: config.Settings, file: Path, first: FirstLink) -> Iterator[I
         _append(settings.broker.acl, first.rules)
     yield InitStep(settings.broker.acl, made, f"access rules of the link's user, {LINK_USER}")
     if first.password_file is not None:
-        made = _write_new(file.parent / first.password_file, "", mode=0o600)
+        made = write_new(file.parent / first.password_file, "", mode=0o600)
         text = f"put the password of {first.username} at {server.host} in its first line"
         yield InitStep(file.parent / first.password_file, made, text)
     _append(file, first.section)
@@ -371,7 +371,7 @@ def _users(
     users.set(user, password)
     if password_file is not None:  # before the users file: an interruption must not lose it
         password_file.unlink(missing_ok=True)
-        _write_new(password_file, password + "\n", mode=0o600)
+        write_new(password_file, password + "\n", mode=0o600)
     users.save()
     yield InitStep(path, True, f"users: {user}")
     if password_file is not None:
@@ -379,7 +379,7 @@ def _users(
     yield Credentials(user, password)
 
 
-def _write_new(path: Path, text: str, mode: int = 0o644) -> bool:
+def write_new(path: Path, text: str, mode: int = 0o644) -> bool:
     """Write the file and sync it, unless it exists; returns whether it was written."""
     if path.exists():
         return False

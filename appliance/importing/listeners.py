@@ -1,0 +1,144 @@
+"""Listeners and their TLS, as `broker.listeners` and `broker.tls` of appliance.yaml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from appliance.importing.model import Block, Configuration, Listener
+from appliance.importing.notes import Notes
+from appliance.importing.options import OPTIONS
+from appliance.importing.reading import Statement, locate
+
+_TLS_FILES = {"certfile": "certificate", "keyfile": "key", "cafile": "ca", "crlfile": "crl"}
+_VERSIONS = {"tlsv1.2": "1.2", "tlsv1.3": "1.3"}
+#: A listener with one of these would let in, or mix up, whom mosquitto keeps apart.
+_LEFT_OUT = ("psk_hint", "mount_point", "enable_proxy_protocol")
+
+
+def carried(configuration: Configuration, notes: Notes) -> list[Listener]:
+    """The listeners that have a counterpart; the others are noted."""
+    kept = []
+    for listener in configuration.listeners:
+        protocol = listener.get("protocol")
+        reasons = listener.every(*_LEFT_OUT)
+        if protocol is not None and protocol.value == "http_api":
+            text = f"{listener} is left out: the appliance's HTTP is `protocol: web`, docs/http.md"
+            notes.add(protocol.place, "protocol", text)
+        elif listener.get("certfile") is None and listener.get("keyfile") is not None:
+            text = f"{listener} has a keyfile and no certfile: it is left out"
+            notes.add(listener.place, "keyfile", text, to_do=True)
+        elif listener.get("keyfile") is None and listener.get("certfile") is not None:
+            text = f"{listener} has a certfile and no keyfile: it is left out"
+            notes.add(listener.place, "certfile", text, to_do=True)
+        elif not reasons:  # these are noted as all options without a counterpart
+            kept.append(listener)
+    return kept
+
+
+def section(listener: Listener, anonymous: bool | None, notes: Notes) -> dict[str, Any]:
+    """One entry of `broker.listeners`."""
+    found: dict[str, Any] = {"bind": _bind(listener)}
+    if listener.is_tls:
+        found["tls"] = True
+        required = listener.flag("require_certificate")
+        found["client_certificates"] = "required" if required else "off"
+        version = listener.get("tls_version")
+        if version is not None:
+            if version.value in _VERSIONS:
+                found["min_version"] = _VERSIONS[version.value]
+            else:
+                text = "TLS before 1.2 is broken, and not spoken: devices that need it stay out"
+                notes.add(version.place, version.name, text)
+        ciphers = listener.get("ciphers")
+        if ciphers is not None:
+            found["ciphers"] = ciphers.value
+    if listener.is_websocket:
+        found["protocol"] = "websocket"
+        text = "clients connect to the path /mqtt, where mosquitto takes any path"
+        protocol = listener.get("protocol")
+        notes.add(protocol.place if protocol else listener.place, "protocol websockets", text)
+    if anonymous is not None:
+        found["anonymous"] = anonymous
+    if listener.path:
+        text = "who may open the socket is said by its `mode`: 0660 lets its user and group"
+        notes.add(listener.place, str(listener), text)
+    return found
+
+
+def _bind(listener: Listener) -> str:
+    if listener.path:
+        return f"unix:{listener.path}"
+    host = listener.host
+    if listener.get("bind_interface") is not None:
+        host = "127.0.0.1"
+    domain = listener.get("socket_domain")
+    if not host and domain is not None:
+        host = "0.0.0.0" if domain.value == "ipv4" else "::"
+    return f"[{host}]:{listener.port}" if ":" in host else f"{host}:{listener.port}"
+
+
+def tls(listeners: list[Listener], directory: Path, notes: Notes) -> dict[str, Any]:
+    """The section `broker.tls`: of the first listener with TLS, as there is one for all."""
+    secure = [listener for listener in listeners if listener.is_tls]
+    if not secure:
+        return {}
+    found: dict[str, Any] = {}
+    first = secure[0]
+    for option, key in _TLS_FILES.items():
+        # Who is trusted matters where certificates are asked for.
+        owner = next((each for each in secure if each.flag("require_certificate")), first)
+        chosen = (owner if option in ("cafile", "crlfile") else first).get(option)
+        if chosen is not None:
+            _add_file(chosen, key, found, directory, notes)
+        for listener in secure:
+            other = listener.get(option)
+            if other is None or (chosen is not None and other.value == chosen.value):
+                continue
+            text = f"{OPTIONS[option].text} is one for all listeners"
+            said = f"{text}, that of {chosen.place}" if chosen else text
+            notes.add(other.place, option, f"{said}: this one is not carried over")
+    found |= _username(secure, notes)
+    return found
+
+
+def _add_file(
+    statement: Statement, key: str, found: dict[str, Any], directory: Path, notes: Notes
+) -> None:
+    path = locate(statement.value, directory)
+    if path is None or not path.is_file():
+        made = " (`appliance init` makes one of its own)" if key in ("certificate", "key") else ""
+        text = f"there is no file {statement.value} here that can be read: put it there, and name "
+        text += f"it as broker.tls.{key}{made}"
+        notes.add(statement.place, statement.name, text, to_do=True)
+        return
+    found[key] = str(path.absolute())
+
+
+def _username(secure: list[Listener], notes: Notes) -> dict[str, Any]:
+    required = [each for each in secure if each.flag("require_certificate")]
+    by_identity = [each for each in required if each.flag("use_identity_as_username")]
+    for listener in secure:
+        if listener not in required:
+            statement = listener.get("use_identity_as_username")
+            if statement is not None and statement.flag:
+                text = "counts only with require_certificate, which this listener has not"
+                notes.add(statement.place, statement.name, text)
+    if not by_identity:
+        return {}
+    for listener in required:
+        if listener not in by_identity:
+            text = (
+                f"{listener}: broker.tls.username_from is one for all listeners, so that here, "
+                "too, a certificate names the user"
+            )
+            notes.add(listener.place, "use_identity_as_username", text)
+    return {"username_from": "subject"}
+
+
+def without_counterpart(block: Block, notes: Notes) -> None:
+    """Note the options of a block that have none."""
+    for statement in block.statements:
+        option = OPTIONS.get(statement.name)
+        if option is not None and option.fate == "none" and statement.value not in option.same:
+            notes.add(statement.place, statement.name, option.text)
