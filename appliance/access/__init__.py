@@ -8,6 +8,7 @@ from appliance.access.login import LoginPlugins, LoginPolicy, no_user
 from appliance.access.passwords import Passwords, check_hash, check_password, check_username
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.rules import Permission, Rule
+from appliance.access.token_file import TokenFile
 from appliance.access.tokens import LIFETIME as TOKEN_LIFETIME
 from appliance.access.tokens import is_token
 from appliance.broker.values import Refusal
@@ -28,6 +29,7 @@ __all__ = [
     "Refusal",
     "Rule",
     "Rules",
+    "TokenFile",
     "check_hash",
     "check_password",
     "check_username",

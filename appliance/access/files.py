@@ -7,6 +7,7 @@ import hmac
 import logging
 import os
 import secrets
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from appliance.access.passwords import Passwords
 from appliance.access.problems import AccessFileError, FileProblem
 from appliance.access.scram import METHOD, ScramExchange, Verifier
 from appliance.access.throttle import LoginThrottle, RecentKeys
+from appliance.access.token_file import TokenFile
 from appliance.access.tokens import Token, Tokens, is_token
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Action, Decision, Identity, Refusal
@@ -171,6 +173,7 @@ class FileAccess:
         self._max_wait = max_wait
         self.throttle = LoginThrottle(failed_logins)
         self.tokens = Tokens()
+        self._token_file: TokenFile | None = None
         # Of two cores one is left to the event loop.
         workers = min(2, max(1, (os.cpu_count() or 1) // 2))
         self._hashing: HashingPool[str | None] = HashingPool(workers, max_waiting)
@@ -203,6 +206,7 @@ class FileAccess:
             _log.info(
                 "%d tokens of users with another password, or removed ones, have ended", ended
             )
+            self._save_tokens()
         self.epoch += 1
         return Changes.between(before, rules)
 
@@ -210,6 +214,8 @@ class FileAccess:
         """Stop the threads; logins that wait are refused. May be called twice."""
         self._closed = True
         self._hashing.close()  # A hash takes some 20 ms.
+        if self._token_file is not None:
+            self._token_file.close()
 
     def users(self) -> list[str]:
         """The names of all users, sorted."""
@@ -318,9 +324,27 @@ class FileAccess:
 
     def _valid(self, token: bytes) -> Token | None:
         found = self.tokens.find(token)
-        if found is not None and found.stored == self._passwords.hash_of(found.username):
+        if found is not None and found.is_of(self._passwords.hash_of(found.username)):
             return found
         return None
+
+    def keep_tokens(self, file: TokenFile) -> None:
+        """Have the tokens of the file in force, of users whose password is the same, and save
+        there those that are in force from now on."""
+        self.tokens.restore(file.read())
+        self.tokens.end_outdated(self._passwords.hash_of)
+        self._token_file = file
+
+    async def _tokens_saved(self) -> None:
+        """Save the tokens, and return when a restart finds them as they are now."""
+        saving = self._save_tokens()
+        if saving is not None:
+            # A caller that gives up must not take it back.
+            await asyncio.shield(asyncio.wrap_future(saving))
+
+    def _save_tokens(self) -> Future[None] | None:
+        file = None if self._closed else self._token_file
+        return None if file is None else file.save(self.tokens.all())
 
     async def issue_token(self, username: str, password: bytes, address: str) -> str | Refusal:
         """A token of the user for its password, which is checked as at a login.
@@ -334,15 +358,27 @@ class FileAccess:
             return who
         stored = self._passwords.hash_of(username)
         assert stored is not None  # `authenticate` has just found it
-        return self.tokens.issue(username, stored) or _TOO_MANY_TOKENS
+        issued = self.tokens.issue(username, stored)
+        if issued is None:
+            return _TOO_MANY_TOKENS
+        await self._tokens_saved()
+        return issued
 
-    def end_token(self, username: str, token: bytes) -> bool:
+    async def end_token(self, username: str, token: bytes) -> bool:
         """End a token of this user; returns whether there was one."""
         found = self.tokens.find(token)
         if found is None or found.username != username:
             return False
         self.tokens.end(token)
+        await self._tokens_saved()
         return True
+
+    async def end_tokens(self, username: str) -> int:
+        """End all tokens of this user; returns how many."""
+        ended = self.tokens.end_all_of(username)
+        if ended:
+            await self._tokens_saved()
+        return ended
 
     def _reserve(self, address: str, login: bytes) -> float | None:
         """Reserve a check for the login; returns the seconds until then, None when too many."""

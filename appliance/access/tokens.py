@@ -1,8 +1,9 @@
 """Tokens: a user stays signed in for a while without its password.
 
 A token takes the place of the password in a login of its user, and has no right of its own. It ends
-with its time, with another password of the user or its removal, and with the process: tokens are in
-memory only, as HMACs under a key of this process. So neither the memory nor the time of a look-up
+with its time, with another password of the user or its removal, and with the computer's start, as
+its time is by a clock that begins there. Kept is the SHA-256 of its random bits alone, and of the
+hash of the password: neither the memory, nor the file (`token_file.py`), nor the time of a look-up
 tells a token.
 
 A password of this form is always taken for a token. So one that has ended costs no hash, and is no
@@ -11,11 +12,11 @@ guess that delays others; and no plugin is shown it.
 
 from __future__ import annotations
 
-import hmac
+import hashlib
 import re
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -49,11 +50,22 @@ def since_start() -> float:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """What is known of a token: its user, the hash of the user's password then, and its end."""
+    """What is known of a token: its digest, its user, that of the hash of the user's password then,
+    and its end, see `since_start`."""
 
+    digest: str
     username: str
-    stored: str
+    password: str
     ends_at: float
+
+    def is_of(self, stored: str | None) -> bool:
+        """Whether the user's password still has the hash that it had."""
+        return stored is not None and self.password == digest_of(stored.encode())
+
+
+def digest_of(secret: bytes) -> str:
+    """What is kept of a secret that nobody can guess."""
+    return hashlib.sha256(secret).hexdigest()
 
 
 class Tokens:
@@ -61,9 +73,8 @@ class Tokens:
 
     def __init__(self, clock: Callable[[], float] = since_start) -> None:
         self._clock = clock
-        self._key = secrets.token_bytes(32)
-        #: By the HMAC of the token, the oldest first.
-        self._known: dict[bytes, Token] = {}
+        #: By their digests, the oldest first.
+        self._known: dict[str, Token] = {}
         self.issued = 0
 
     def __len__(self) -> int:
@@ -71,27 +82,50 @@ class Tokens:
         self._expire()
         return len(self._known)
 
+    def all(self) -> list[Token]:
+        """Those in force, the oldest first."""
+        self._expire()
+        return list(self._known.values())
+
+    def restore(self, tokens: Iterable[Token]) -> None:
+        """Have these in force again, as many as there may be, where they have not ended meanwhile.
+
+        What would last longer than a new one is none of ours.
+        """
+        latest = self._clock() + LIFETIME
+        for token in tokens:
+            if token.ends_at <= latest:
+                self._add(token)
+        self._expire()
+
     def issue(self, username: str, stored: str) -> str | None:
         """A new token of the user, whose password has this hash; None when there are too many."""
         self._expire()
-        own = [key for key, token in self._known.items() if token.username == username]
-        if len(own) >= MOST_OF_USER:
-            del self._known[own[0]]
-        elif len(self._known) >= MOST:
-            return None
         text = PREFIX + secrets.token_urlsafe(_RANDOM)
-        self._known[self._digest(text.encode())] = Token(username, stored, self._clock() + LIFETIME)
+        ends_at = self._clock() + LIFETIME
+        token = Token(digest_of(text.encode()), username, digest_of(stored.encode()), ends_at)
+        if not self._add(token):
+            return None
         self.issued += 1
         return text
 
+    def _add(self, token: Token) -> bool:
+        own = [key for key, each in self._known.items() if each.username == token.username]
+        if len(own) >= MOST_OF_USER:
+            del self._known[own[0]]
+        elif len(self._known) >= MOST:
+            return False
+        self._known[token.digest] = token
+        return True
+
     def find(self, text: bytes) -> Token | None:
         """The token, if it is in force; its user's password may have changed since."""
-        token = self._known.get(self._digest(text))
+        token = self._known.get(digest_of(text))
         return token if token is not None and token.ends_at > self._clock() else None
 
     def end(self, text: bytes) -> None:
         """End a token; does nothing if there is none."""
-        self._known.pop(self._digest(text), None)
+        self._known.pop(digest_of(text), None)
 
     def end_all_of(self, username: str) -> int:
         """End all tokens of a user; returns how many."""
@@ -99,7 +133,7 @@ class Tokens:
 
     def end_outdated(self, hash_of: Callable[[str], str | None]) -> int:
         """End those whose user is gone or has another password; returns how many."""
-        return self._keep(lambda token: token.stored == hash_of(token.username))
+        return self._keep(lambda token: token.is_of(hash_of(token.username)))
 
     def _expire(self) -> None:
         now = self._clock()
@@ -109,6 +143,3 @@ class Tokens:
         before = len(self._known)
         self._known = {key: token for key, token in self._known.items() if is_kept(token)}
         return before - len(self._known)
-
-    def _digest(self, text: bytes) -> bytes:
-        return hmac.digest(self._key, text, "sha256")

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import psutil
 import uvloop
 
-from appliance.access import AccessFileError, FileAccess, LoginPolicy, no_user
+from appliance.access import AccessFileError, FileAccess, LoginPolicy, TokenFile, no_user
 from appliance.access.enrolments import Enrolments
 from appliance.app import management, status, wiring
 from appliance.app.links import Links
@@ -60,6 +60,7 @@ from appliance.ros.ros1.node import Ros1Node
 from appliance.ros.ros2 import discovery
 from appliance.ros.ros2.node import Ros2Node
 from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
+from appliance.store.clock import boot_id
 
 if TYPE_CHECKING:
     from appliance.net.http import HttpSite
@@ -159,6 +160,7 @@ class App:
         self._stack.callback(access.close)
         limits = broker_settings.limits
         store = self._open_store()
+        self._keep_tokens(access)
         self.broker = broker = Broker(
             access,
             store,
@@ -258,6 +260,12 @@ class App:
         store.open()
         self._stack.push_async_callback(store.close)
         return store
+
+    def _keep_tokens(self, access: FileAccess) -> None:
+        """Beside the store, where there is one, and where a boot of the computer has an id."""
+        stored, boot = self.settings.broker.store, boot_id()
+        if stored.durability != "off" and boot:
+            access.keep_tokens(TokenFile(stored.path.with_name("tokens.json"), boot))
 
     def _run_in_background(self, work: Callable[[], Coroutine[object, object, None]]) -> None:
         """Run a task until the appliance stops; a failed task is reported and restarted."""

@@ -65,8 +65,8 @@ class TokenVerbs:
     async def _end(self, caller: Caller, wanted: OwnToken) -> dict[str, Any]:
         user, access = _user(caller), self._access
         if wanted.token is None:
-            return {"ended": access.tokens.end_all_of(user)}
-        return {"ended": int(access.end_token(user, wanted.token.encode()))}
+            return {"ended": await access.end_tokens(user)}
+        return {"ended": int(await access.end_token(user, wanted.token.encode()))}
 
 
 def _user(caller: Caller) -> str:

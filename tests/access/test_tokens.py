@@ -140,12 +140,12 @@ async def test_it_ends_with_the_user(access: FileAccess, files: tuple[Path, Path
 
 async def test_who_ends_it(access: FileAccess):
     token, other = await issue(access), await issue(access)
-    assert not access.end_token("bob", token.encode())
-    assert not access.end_token("alice", UNKNOWN.encode())
-    assert access.end_token("alice", token.encode())
-    assert not access.end_token("alice", token.encode())
+    assert not await access.end_token("bob", token.encode())
+    assert not await access.end_token("alice", UNKNOWN.encode())
+    assert await access.end_token("alice", token.encode())
+    assert not await access.end_token("alice", token.encode())
     assert not await enter(access, token) and await enter(access, other)
-    assert access.tokens.end_all_of("bob") == 0 and access.tokens.end_all_of("alice") == 1
+    assert await access.end_tokens("bob") == 0 and await access.end_tokens("alice") == 1
     assert not await enter(access, other)
 
 

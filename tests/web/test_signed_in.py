@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -14,8 +15,10 @@ from test_journeys import odometry as odometry
 from visits import DESKTOP, PHONE, Visit
 from waiting import eventually
 
+from appliance.access import Passwords
+
 pytest.importorskip("rclpy")
-pytest.importorskip("playwright.sync_api")
+sync_api = pytest.importorskip("playwright.sync_api")
 
 BACK_WITHIN = 5.0  # seconds after the appliance listens again
 STORED = "sessionStorage.getItem('console')"
@@ -96,48 +99,101 @@ def test_what_is_stored_is_not_ours(visit: Callable[..., Visit], kept: str) -> N
     reload(visited, "input[name=password]")
 
 
+@contextmanager
+def odometry_of(appliance: ApplianceProcess) -> Iterator[Odometry]:
+    """What this run of the appliance tells."""
+    odometry = Odometry(appliance)
+    with odometry.peer as peer:
+        peer.subscribe(f"{ROBOT}/odom")
+        yield odometry
+
+
+def lost(visited: Visit) -> None:
+    """Wait until the page says so."""
+    visited.page.wait_for_selector("text=The connection is lost; trying again.")
+
+
+def is_back(visited: Visit) -> None:
+    """Wait until the page is at its robot again."""
+    visited.page.wait_for_selector("text=The connection is lost; trying again.", state="detached")
+
+
+def forget_the_gap(*visits: Visit) -> None:
+    """The browser reports what it could not have meanwhile."""
+    gap = ("/readyz", "Failed to load", "WebSocket connection", "ERR_CONNECTION_REFUSED")
+    for each in visits:
+        each.wrong = [wrong for wrong in each.wrong if not any(part in wrong for part in gap)]
+
+
 @pytest.mark.timed
+@pytest.mark.parametrize("end", [ApplianceProcess.stop, ApplianceProcess.kill])
 def test_the_appliance_starts_again(
-    visit: Callable[..., Visit], odometry: Odometry, appliance: ApplianceProcess
+    visit: Callable[..., Visit],
+    appliance: ApplianceProcess,
+    end: Callable[[ApplianceProcess], None],
 ) -> None:
-    """The page is back by itself, and what was commanded before is over."""
-    visited, second = visit(**PHONE), visit(**PHONE)
+    """The page is back by itself, and what was commanded before is over.
+
+    So is one that was loaded again before, which has only the token, and one that is loaded while
+    nobody answers. The token is the one of before.
+    """
+    visited, reloaded, gone = visit(**PHONE), visit(**PHONE), visit(**PHONE)
     page = visited.sign_in(page="Drive")
-    kept = stored(page)
-    other = second.sign_in()
-    stored(other)
-    reload(second, "nav")  # it has only the token
-    hold(page)
-    eventually(lambda: odometry.speed > SPEED, "it drives")
-    appliance.stop()
-    page.wait_for_selector("text=The connection is lost; trying again.")
+    kept = {each: stored(each.sign_in()) for each in (reloaded, gone)}
+    kept[visited] = stored(page)
+    reload(reloaded, "nav")
+    with odometry_of(appliance) as odometry:
+        hold(page)
+        eventually(lambda: odometry.speed > SPEED, "it drives")
+        end(appliance)
+    lost(visited)
+    lost(reloaded)
     page.mouse.up()
+    with pytest.raises(sync_api.Error, match="ERR_CONNECTION_REFUSED"):
+        gone.page.reload()
     appliance.start()
     begun = time.monotonic()
-    page.wait_for_selector("text=The connection is lost; trying again.", state="detached")
+    is_back(visited)
+    is_back(reloaded)
     back_after = time.monotonic() - begun
-    anew = Odometry(appliance)
-    with anew.peer as peer:
-        peer.subscribe(f"{ROBOT}/odom")
+    reload(gone, "nav")
+    with odometry_of(appliance) as anew:
         anew.stands()
         page.wait_for_selector("dd:text-is('ready')")
         anew.stands()
-        eventually(lambda: stored(page)["token"] != kept["token"], "a token of the new process")
-        other.wait_for_selector("text=You were signed out. Sign in again.")
         hold(page)
         eventually(lambda: anew.speed > SPEED, "it drives again")
         page.mouse.up()
         anew.stands()
-    # The browser reports what it could not have meanwhile.
-    for each in (visited, second):
-        each.wrong = [
-            wrong
-            for wrong in each.wrong
-            if not wrong.endswith("/readyz")
-            and "Failed to load" not in wrong
-            and "WebSocket connection" not in wrong
-        ]
+    for each, token in kept.items():
+        assert stored(each.page) == token
+        each.page.wait_for_selector("nav")
+    forget_the_gap(*kept)
     assert back_after < BACK_WITHIN
+
+
+def test_a_password_that_changed_while_the_appliance_was_down(
+    visit: Callable[..., Visit], appliance: ApplianceProcess
+) -> None:
+    """The page that has only the token is out; one that has the password asks for the new one."""
+    visited, reloaded = visit(**PHONE), visit(**PHONE)
+    for each in (visited, reloaded):
+        stored(each.sign_in())
+    reload(reloaded, "nav")
+    path = appliance.directory / "users.passwd"
+    before = path.read_text()
+    appliance.kill()
+    users = Passwords.load(path)
+    users.set("alice", "another-password-1")
+    users.save()
+    appliance.start()
+    for each in (visited, reloaded):
+        each.page.wait_for_selector("input[name=password]")
+        assert each.page.evaluate(STORED) is None
+    appliance.kill()
+    path.write_text(before)
+    appliance.start()
+    forget_the_gap(visited, reloaded)
 
 
 def test_a_program_that_could_not_be_loaded_is_loaded_by_the_next_login(

@@ -64,13 +64,13 @@ export function open(more, packet) {
   client.on('error', ({ code }) => {
     if (!WRONG.includes(code) || !client.options.password?.startsWith(TOKEN)) return
     if (login?.token === client.options.password) tokenHasEnded()
-    // With the password, and without a pause: it is the robot that has started again.
+    // With the password, and without a pause: it is the robot's computer that has started again.
     if (login !== null && client.options.reconnectPeriod) setTimeout(() => client.reconnect())
   })
   return client
 }
 
-/** With its time, another password, or the appliance: the password gets another one. */
+/** With its time, another password, or the robot's computer: the password gets another one. */
 function tokenHasEnded() {
   login.token = null
   if (login.password === undefined) {
