@@ -162,7 +162,7 @@ _GENERAL: Final = {
 
 _LISTENER: Final = {
     "accept_protocol_versions": _none(
-        "listener", "text", "MQTT 3.1.1 and 5 are taken, and MQTT 3.1 is not"
+        "listener", "text", "MQTT 3.1, 3.1.1 and 5 are all taken", ("3,4,5", "3, 4, 5")
     ),
     "bind_address": _carried("listener", "text", "broker.listeners"),
     "bind_interface": _none(
