@@ -224,6 +224,12 @@ class WebSocketLayer(MiddleLayer):
     @contained("websocket.lost")
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended, from either side."""
+        frames = self._frames
+        # The library's parser is a generator that refers to its owner, and so do the frames in which
+        # it has caught an exception: circles, which would be kept with what came of a frame.
+        frames.parser.close()
+        _forget_traceback(frames.parser_exc)
+        _forget_traceback(frames.handshake_exc)
         self._protocol.connection_lost(exc)
 
     # --- towards the protocol ------------------------------------------------------------------
@@ -359,3 +365,9 @@ class _Frames(EachFrame, ServerProtocol):
             if subprotocol in SUBPROTOCOLS:
                 return subprotocol
         raise NegotiationError(f"offer the subprotocol {' or '.join(SUBPROTOCOLS)}")
+
+
+def _forget_traceback(error: BaseException | None) -> None:
+    while error is not None:
+        error.__traceback__ = None
+        error = error.__cause__ or error.__context__

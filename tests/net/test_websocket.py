@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import gc
 import itertools
 import random
 import ssl
@@ -24,6 +25,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Response
+from websockets.protocol import Protocol as FrameProtocol
 
 from appliance.broker.limits import Limits
 from appliance.broker.message import Message
@@ -45,8 +47,9 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.net import connection as net_connection
 from appliance.net.scheduler import COST_PER_ROUND
-from appliance.net.websocket import FRAME_COST
+from appliance.net.websocket import FRAME_COST, WebSocketLayer
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -889,3 +892,50 @@ async def test_a_ping_in_two_segments_makes_nothing_old(harness: Harness, behind
     await peer.send(command[behind:])
     await until(lambda: ages)
     assert ages[0] <= loop.time() - begun
+
+
+# --- memory --------------------------------------------------------------------------------------
+
+
+ENDS = {
+    "nothing": b"",
+    "a part of a head": REQUEST[:-2],
+    "no HTTP": b"\x10\x0c",
+    "another path": REQUEST.replace(b"/mqtt", b"/"),
+    "no request": b"GET /mqtt HTTP/1.1\r\n\r\n",
+    "no frame": REQUEST,
+    "a part of a frame": REQUEST + frame(Connect("a").encode(5))[:-2],
+    "a part of a CONNECT": REQUEST + frame(Connect("a").encode(5)[:-2]),
+    "a client": REQUEST + frame(Connect("a").encode(5)),
+    "a client that leaves": REQUEST + frame(Connect("a").encode(5) + Disconnect(0).encode(5)),
+    "a close frame": REQUEST + frame(b"\x03\xe8", Opcode.CLOSE),
+    "a wrong frame": REQUEST + b"\xff\xff",
+    "a text": REQUEST + frame(b"a", Opcode.TEXT),
+    "too large": REQUEST + b"\x82\xff" + (1 << 40).to_bytes(8, "big") + bytes(4),
+}
+
+
+def _connections() -> list[object]:
+    kinds = (net_connection.ClientConnection, WebSocketLayer, FrameProtocol)
+    return [each for each in gc.get_objects() if isinstance(each, kinds)]
+
+
+@both
+@pytest.mark.parametrize("said", ENDS)
+async def test_the_memory_of_a_connection_is_free_at_once(harness: Harness, tls, said):
+    """However it ends, and not only when garbage is looked for, which is among the young alone."""
+    await harness.start()
+    harness.ports[0:2] = harness.ports[2:4]
+    gc.collect()
+    before = len(_connections())
+    gc.disable()
+    try:
+        peer = await harness.dial(tls)
+        await until(lambda: len(_connections()) > before)
+        await peer.send(ENDS[said])
+        with contextlib.suppress(TimeoutError, OSError):
+            await asyncio.wait_for(peer.reader.read(), 0.1)
+        peer.hang_up()
+        await until(lambda: len(_connections()) <= before)
+    finally:
+        gc.enable()
