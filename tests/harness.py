@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
+import logging
 import socket
 import ssl
 from collections.abc import Callable
 from pathlib import Path
 
+import h11
 from broker.conftest import check_accounts
-from waiting import PATIENCE
+from waiting import PATIENCE, until
+from websockets.protocol import Protocol as FrameProtocol
 
 from appliance import certs
 from appliance.broker.broker import Broker
@@ -23,6 +27,7 @@ from appliance.mqtt.codec import decode_varint
 from appliance.mqtt.packets import Connack, Connect, Packet, decode_packet
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.connection import ClientConnection
+from appliance.net.layers import MiddleLayer
 from appliance.net.listeners import Admission, Listeners, ListenerSettings
 from appliance.net.scheduler import Scheduler
 from appliance.store import MemoryStore
@@ -115,6 +120,25 @@ class Harness:
         self.peers.append(peer)
         return peer
 
+    async def expect_free_memory(self, said: bytes, tls: bool) -> None:
+        """However a client leaves that has said this, nothing of its connection is in memory: not
+        only when garbage is looked for, which is among young objects alone."""
+        gc.collect()
+        before = len(_layers())
+        gc.disable()
+        logging.disable()  # pytest keeps the records, with what is in them
+        try:
+            peer = await self.dial(tls)
+            await until(lambda: len(_layers()) > before, "a connection")
+            await peer.send(said)
+            with contextlib.suppress(TimeoutError, asyncio.TimeoutError, OSError):
+                await asyncio.wait_for(peer.reader.read(), 0.1)
+            peer.hang_up()
+            await until(lambda: len(_layers()) <= before, "free memory")
+        finally:
+            logging.disable(logging.NOTSET)
+            gc.enable()
+
     async def log_in(self, client_id: str, *, tls: bool = False, receive_buffer: int = 0) -> Peer:
         """A client that has logged in."""
         peer = await self.dial(tls, receive_buffer)
@@ -159,6 +183,12 @@ def check_scheduler(scheduler: Scheduler) -> None:
             wires[strangers] += protocol._client._held
     assert strangers.bytes == wires[strangers]
     check_accounts(scheduler.broker, wires=total, wires_of=wires)
+
+
+def _layers() -> list[object]:
+    """Of all connections: their layers, and what the libraries keep for these."""
+    kinds = (ClientConnection, MiddleLayer, FrameProtocol, h11.Connection)
+    return [each for each in gc.get_objects() if isinstance(each, kinds)]
 
 
 def abort(transport: asyncio.WriteTransport) -> None:

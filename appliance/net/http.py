@@ -336,6 +336,8 @@ class HttpLayer(MiddleLayer):
             event = http.next_event()
             following = http.next_event()
         except h11.RemoteProtocolError as error:
+            # h11 raises it out of a frame that refers to it: a circle, which nobody would break.
+            error.__traceback__ = None
             self._refuse(error.error_status_hint, str(error))
             return
         if type(event) is not h11.Request:

@@ -6,7 +6,8 @@ import asyncio
 import logging
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections import deque
+from collections.abc import AsyncIterator, MutableSequence
 from typing import Any
 
 import pytest
@@ -40,7 +41,7 @@ class WebHarness(Harness):
     def make(
         self, connections: int = 100, connect_timeout: float = PATIENCE, **limits: float
     ) -> Listeners:
-        self.requests: list[HttpRequest] = []
+        self.requests: MutableSequence[HttpRequest] = []
         self.slow = asyncio.Event()
         site = WebSite(
             {
@@ -452,3 +453,29 @@ def test_nothing_of_it_is_imported_before_it_is_wanted():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PATIENCE
     )
     assert done.stdout.strip() == "[]"
+
+
+UPGRADE = (
+    b"GET /mqtt HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+)
+
+ENDS = {
+    "nothing": b"",
+    "a part of a head": GET[:-2],
+    "no HTTP": b"\x10\x0c",
+    "a wrong head": b"GET /small HTTP/9.9\r\nHost\r\n\r\n",
+    "an answer": GET,
+    "a part of a large answer": b"GET /large HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    "a part of a body": b"POST /body HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\nab",
+    "a WebSocket": UPGRADE + b"Sec-WebSocket-Protocol: mqtt\r\n\r\n",
+    "half a WebSocket": UPGRADE.partition(b"Sec-")[0] + b"\r\n",
+}
+
+
+@pytest.mark.parametrize("tls", [False, True])
+@pytest.mark.parametrize("said", ENDS)
+async def test_the_memory_of_a_connection_is_free_at_once(harness: WebHarness, tls, said):
+    await harness.start()
+    harness.requests = deque(maxlen=0)  # a request knows its connection
+    await harness.expect_free_memory(ENDS[said], tls)

@@ -1118,3 +1118,35 @@ async def test_who_stays_slow_is_told_in_the_log(harness: Harness, monkeypatch, 
     await until(lambda: "client 'deaf' (anonymous)" in caplog.text)
     assert "does not read" in caplog.text
     deaf.hang_up()
+
+
+@pytest.mark.parametrize("tls", [False, True])
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"",
+        Connect("a").encode(5)[:-2],
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"\x10\xff\xff\xff\xff\x7f",
+        Connect("a").encode(5),
+        Connect("a").encode(5) + b"\x30\x05\x00",
+        Connect("a").encode(5) + b"\x30\x02\x00\x01",
+        Connect("a").encode(5) + Disconnect(0).encode(5),
+        Connect("refused").encode(5),
+    ],
+    ids=[
+        "nothing",
+        "a part of a CONNECT",
+        "HTTP",
+        "no length",
+        "a client",
+        "a part of a packet",
+        "a wrong packet",
+        "a client that leaves",
+        "a refused one",
+    ],
+)
+async def test_the_memory_of_a_connection_is_free_at_once(harness: Harness, tls: bool, said: bytes):
+    harness.refused.add("refused")
+    await harness.start()
+    await harness.expect_free_memory(said, tls)

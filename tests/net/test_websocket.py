@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import gc
 import itertools
 import random
 import ssl
@@ -25,7 +24,6 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Response
-from websockets.protocol import Protocol as FrameProtocol
 
 from appliance.broker.limits import Limits
 from appliance.broker.message import Message
@@ -47,9 +45,8 @@ from appliance.mqtt.packets import (
     decode_packet,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.net import connection as net_connection
 from appliance.net.scheduler import COST_PER_ROUND
-from appliance.net.websocket import FRAME_COST, WebSocketLayer
+from appliance.net.websocket import FRAME_COST
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -915,27 +912,10 @@ ENDS = {
 }
 
 
-def _connections() -> list[object]:
-    kinds = (net_connection.ClientConnection, WebSocketLayer, FrameProtocol)
-    return [each for each in gc.get_objects() if isinstance(each, kinds)]
-
-
 @both
 @pytest.mark.parametrize("said", ENDS)
 async def test_the_memory_of_a_connection_is_free_at_once(harness: Harness, tls, said):
     """However it ends, and not only when garbage is looked for, which is among the young alone."""
     await harness.start()
     harness.ports[0:2] = harness.ports[2:4]
-    gc.collect()
-    before = len(_connections())
-    gc.disable()
-    try:
-        peer = await harness.dial(tls)
-        await until(lambda: len(_connections()) > before)
-        await peer.send(ENDS[said])
-        with contextlib.suppress(TimeoutError, OSError):
-            await asyncio.wait_for(peer.reader.read(), 0.1)
-        peer.hang_up()
-        await until(lambda: len(_connections()) <= before)
-    finally:
-        gc.enable()
+    await harness.expect_free_memory(ENDS[said], tls)
