@@ -225,8 +225,8 @@ class WebSocketLayer(MiddleLayer):
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended, from either side."""
         frames = self._frames
-        # The library's parser is a generator that refers to its owner, and so do the stack frames of
-        # an exception: circles, which would be kept with what was received.
+        # The library's parser is a generator that refers to its owner, and so do the stack frames
+        # of an exception: circles, which would be kept with what was received.
         frames.parser.close()
         _forget_traceback(frames.parser_exc)
         _forget_traceback(frames.handshake_exc)
