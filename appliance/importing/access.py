@@ -71,7 +71,11 @@ class _Converter:
         acl = self._acl(rules, anonymous)
         if not names and not all(anonymous.values()):
             self._tell_of_nobody()
-        if any(anonymous.values()) and passwords is None:
+        securities = [self._configuration.security(each) for each in self._listeners]
+        if any(
+            anonymous[index] and each.get("password_file") is None
+            for index, each in enumerate(securities)
+        ):
             self._tell_of_strangers()
         overall = self._configuration.general.flag(
             "allow_anonymous", self._configuration.local_only

@@ -98,6 +98,13 @@ def tls(listeners: list[Listener], directory: Path, notes: Notes) -> dict[str, A
             text = f"{OPTIONS[option].text} is one for all listeners"
             said = f"{text}, that of {chosen.place}" if chosen else text
             notes.add(other.place, option, f"{said}: this one is not carried over")
+    required = next((each for each in secure if each.flag("require_certificate")), None)
+    if required is not None and "ca" not in found:
+        text = (
+            f"{required} requires certificates, and no file says whose: name one with the CA's as "
+            "broker.tls.ca"
+        )
+        notes.add(required.place, "require_certificate", text, to_do=True)
     found |= _username(secure, notes)
     return found
 

@@ -137,6 +137,24 @@ def test_tls_of_a_listener(tmp_path: Path) -> None:
     assert "mosquitto.conf:13: tls_version: TLS before 1.2 is broken" in told(found)
 
 
+def test_certificates_are_required_and_nobody_says_whose(tmp_path: Path) -> None:
+    text = "listener 8883\ncapath .\ncertfile a\nkeyfile b\nrequire_certificate true\n"
+    found = convert(tmp_path, text, a="x", b="x")
+    said = [str(note) for note in found.notes if note.to_do]
+    assert "listener 8883 requires certificates, and no file says whose" in said[0]
+
+
+def test_names_are_checked_where_mosquitto_takes_any(tmp_path: Path) -> None:
+    text = (
+        "per_listener_settings true\nlistener 1883\npassword_file pw\n"
+        "listener 1884\nallow_anonymous true\n"
+    )
+    said = "mosquitto.conf:5: allow_anonymous: who gives a user name is checked here"
+    assert said in told(convert(tmp_path, text, pw=f"alice:{HASH}\n"))
+    everywhere = text.replace("per_listener_settings true\n", "")
+    assert "is checked here" not in told(convert(tmp_path, everywhere, pw=""))
+
+
 @pytest.mark.parametrize("line", ["psk_hint x", "mount_point x/", "enable_proxy_protocol 2"])
 def test_a_listener_that_keeps_clients_apart_is_left_out(tmp_path: Path, line: str) -> None:
     found = convert(tmp_path, f"listener 1883\nlistener 1884\n{line}\n")
