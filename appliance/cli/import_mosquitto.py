@@ -44,7 +44,10 @@ def import_mosquitto(
             _write(imported, directory)
     except ImportProblemsError as error:
         raise CommandError(f"nothing is imported\n{error}") from None
-    except (ConfigError, OwnerError) as error:
+    except ConfigError as error:
+        text = "nothing is imported: the appliance would not start with what it makes of it"
+        raise CommandError(f"{text}\n{error}") from None
+    except OwnerError as error:
         raise CommandError(str(error)) from None
     _report(imported, directory)
 

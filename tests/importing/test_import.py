@@ -452,6 +452,16 @@ def test_no_file_is_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert not (tmp_path / "appliance.yaml").exists()
 
 
+def test_what_could_not_be_started_is_not_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / MAIN).write_text("listener 1883\nlistener 1883\n")
+    assert run("import", str(tmp_path / MAIN), "--dir", str(tmp_path / "new")) == 1
+    said = capsys.readouterr().err
+    assert "nothing is imported" in said and "listens there already" in said
+    assert not (tmp_path / "new").exists()
+
+
 def test_files_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, said in (("", "is a directory; name the file in it"), ("none", "no such file")):
         assert run("import", str(tmp_path / name), "--dir", str(tmp_path / "new")) == 1
