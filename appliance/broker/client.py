@@ -211,26 +211,31 @@ class ClientHandler:
                 events = protocol.receive_data(data)
             for event in events:
                 self._last_packet_at = now  # for keep alive only complete packets count
-                if type(event) is tuple:
-                    self._on_raw_publish(event)
-                elif type(event) is int:
+                session = self.session
+                if type(event) is int and event < PUBREC and session is not None:  # PUBACK
                     counters.cost += 1
-                    session = self.session
-                    if event < PUBREC and session is not None:  # PUBACK: most of them
-                        counters.control_received += 1
-                        if session.acknowledged(event & 0xFFFF):
-                            # A reader of a full queue acknowledges many in a chunk: to fill the
-                            # window once for them takes a sixth less than once for each. A few at
-                            # a time, as each may make room for a message of any cost.
-                            room += 1
-                            if room == ROOM_FILLED_AT_ONCE:
-                                room = 0
-                                session.fill_window()
-                    else:
-                        self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
+                    counters.control_received += 1
+                    if session.acknowledged(event & 0xFFFF):
+                        # A reader of a full queue acknowledges many in a chunk: to fill the window
+                        # once for them takes a sixth less than once for each. A few at a time, as
+                        # each may make room for a message of any cost.
+                        room += 1
+                        if room == ROOM_FILLED_AT_ONCE:
+                            room = 0
+                            session.fill_window()
                 else:
-                    counters.cost += PACKET_COST + protocol.cost
-                    self._on_packet(event)  # type: ignore[arg-type]
+                    if room and session is not None:
+                        # What comes now finds the queue as these acknowledgements leave it.
+                        room = 0
+                        session.fill_window()
+                    if type(event) is tuple:
+                        self._on_raw_publish(event)
+                    elif type(event) is int:
+                        counters.cost += 1
+                        self._on_acknowledgement(event & 0xFF_0000, event & 0xFFFF, 0)
+                    else:
+                        counters.cost += PACKET_COST + protocol.cost
+                        self._on_packet(event)  # type: ignore[arg-type]
                 if counters.cost > cost and not protocol.paused:
                     # The rest of the chunk waits until the other clients have had their turn.
                     protocol.pause()

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from appliance.broker import client
+from appliance.broker.backpressure import PATIENCE
 from appliance.broker.broker import Broker
 from appliance.broker.limits import Limits
 from appliance.broker.message import Message
@@ -879,24 +880,29 @@ def test_a_packet_cut_in_two_is_as_old_as_its_first_byte(
     assert ages == [pytest.approx(3.05), 0.0]
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("full", ["drop-oldest", "refuse"])
+@pytest.mark.parametrize("own", ["a", "b"])
+@pytest.mark.parametrize("seed", range(10))
 def test_acknowledgements_in_one_chunk_do_what_they_do_one_by_one(
-    access: FakeAccess, seed: int
+    access: FakeAccess, seed: int, own: str, full: str
 ) -> None:
-    """The window is filled once for many of them; the same is sent, in the same order."""
+    """The window is filled once for many of them; the same is sent, in the same order, and what
+    the reader publishes behind them finds the same room, also for itself."""
     chance = random.Random(seed)
     script: list[tuple[int, int]] = []  # how many are published, and then acknowledged
     for _ in range(12):
         script.append((chance.randint(0, 80), chance.randint(0, 60)))
     sent = []
     for together in (True, False):
-        broker = Broker(access, FakeStore(), Limits(inflight=50))
+        limits = Limits(inflight=50, queue_messages=100, queue_full=full)  # type: ignore[arg-type]
+        broker = Broker(access, FakeStore(), limits)
         broker.tick(1000.0)
         reader, writer = Peer(broker), Peer(broker)
         for peer, name in ((reader, "reader"), (writer, "writer")):
             assert peer.connect(name).reason_code == ReasonCode.SUCCESS
         reader.subscribe("a", qos=1)
         arrived: list[tuple[int | None, bytes]] = []
+        answers: list[int] = []
         unacknowledged: deque[int | None] = deque()
         number = 0
         for published, acknowledged in script:
@@ -911,7 +917,9 @@ def test_acknowledgements_in_one_chunk_do_what_they_do_one_by_one(
             ]
             packets: list[Packet] = [Puback(each or 0) for each in first]
             packets.insert(len(packets) // 2, Puback(60_000))  # of no message
-            packets.append(Publish("b", b"between", packet_id=reader.next_id(), qos=1))
+            packets.append(Publish(own, b"between", packet_id=reader.next_id(), qos=1))
+            if reader.session.congestion is not None:
+                reader.session.congestion._allowance.change(-PATIENCE)  # nobody waits for it
             if together:
                 reader.send(*packets)
             else:
@@ -921,8 +929,31 @@ def test_acknowledgements_in_one_chunk_do_what_they_do_one_by_one(
                 if isinstance(each, Publish):
                     arrived.append((each.packet_id, each.payload))
                     unacknowledged.append(each.packet_id)
-        sent.append(arrived)
+                elif isinstance(each, Puback):
+                    answers.append(each.reason_code)
+        sent.append((arrived, answers, drops(broker)))
         assert len(arrived) > 100
         # What the two hold is given back, as the fixture would check.
         check_accounts(broker)
     assert sent[0] == sent[1]
+
+
+@pytest.mark.parametrize("full", ["drop-oldest", "refuse", "disconnect"])
+def test_what_comes_behind_an_acknowledgement_finds_its_room(access: FakeAccess, full: str) -> None:
+    limits = Limits(inflight=1, queue_messages=6, queue_full=full)  # type: ignore[arg-type]
+    broker = Broker(access, FakeStore(), limits)
+    reader, writer = Peer(broker), Peer(broker)
+    reader.connect("reader")
+    writer.connect("writer")
+    reader.subscribe("a", 1)
+    for number in range(7):
+        assert writer.publish("a", b"%d" % number, 1) == 0
+    (first,) = reader.messages()
+    assert reader.session.congestion is not None
+    reader.session.congestion._allowance.change(-PATIENCE)
+    reader.send(Puback(first.packet_id or 0), Publish("a", b"own", 1, packet_id=9))
+    second, answer = reader.received()
+    assert isinstance(second, Publish) and second.payload == b"1"
+    assert isinstance(answer, Puback) and (answer.packet_id, answer.reason_code) == (9, 0)
+    assert not drops(broker) and not reader.transport.closed
+    check_accounts(broker)
