@@ -97,18 +97,87 @@ const notes = (parts) => arranged(parts).notes.join(' ')
 const map = { frame: '/map' }
 assert.deepEqual(at({ grid: map, pose: robot, scan: { frame: 'base', points } }), [1, 3])
 assert.equal(notes({ grid: map, pose: robot, scan: { frame: '/base', points } }), '')
-assert.match(notes({ grid: map, pose: robot, scan: { frame: 'laser', points } }), /laser.*TF.*middle/)
+assert.match(notes({ grid: map, pose: robot, scan: { frame: 'laser', points } }), /laser.*TF.*not bridged.*middle/)
 assert.deepEqual(at({ grid: map, pose: robot, scan: { frame: 'map', points } }), [1, 0])
-assert.match(notes({ grid: map, pose: { ...robot, frame: 'odom' } }), /odom.*map.*not applied/)
+assert.match(notes({ grid: map, pose: { ...robot, frame: 'odom' } }), /odom.*map.*not bridged/)
 assert.match(notes({ grid: map, scan: { frame: 'laser', points } }), /not drawn/)
 assert.match(notes({ grid: map, pose: { ...robot, yaw: null }, scan: { frame: 'laser', points } }), /no heading.*not drawn/)
 assert.deepEqual(at({ scan: { frame: 'laser', points } }), [1, 0])
-assert.deepEqual(arranged({}), { frame: '(without a name)', points: null, notes: [] })
+assert.deepEqual(arranged({}), { frame: '(without a name)', pose: null, points: null, notes: [] })
+
+// Transforms: through the frames, at the time of the message, whatever a stranger says.
+const { Transforms, moved } = await load('transforms')
+let now = 0
+const tf = (from, to, x, y, rotation, sec = 1) => ({
+  header: { stamp: { sec, nanosec: 0 }, frame_id: from }, child_frame_id: to, transform: { translation: { x, y, z: 0 }, rotation },
+})
+const told = (...all) => {
+  const found = new Transforms(() => now)
+  found.take({ transforms: all }, false)
+  return found
+}
+const goes = (transforms, source, target, stamp, from, to) => moved(transforms.between(source, target, stamp), ...from).forEach((value, index) => near(value, to[index]))
+const quarter = turn(Math.PI / 2)
+const tree = told(tf('/map', 'odom', 10, 0, turn(0)), tf('odom', '/base', 1, 2, quarter), tf('base', 'laser', 0.5, 0, quarter), tf('map', 'dock', 3, 0, quarter))
+goes(tree, 'base', 'map', 0, [1, 0], [11, 3])
+goes(tree, 'laser', 'map', 0, [1, 0], [10, 2.5])
+goes(tree, 'laser', 'dock', 0, [1, 0], [2.5, -7])
+goes(tree, 'map', 'base', 0, [11, 3], [1, 0])
+goes(tree, 'base', 'base', 0, [1, 2], [1, 2])
+// Mounted upside down, and on its side.
+goes(told(tf('base', 'laser', 0, 0, { x: 1, y: 0, z: 0, w: 0 })), 'laser', 'base', 0, [1, 2], [1, -2])
+goes(told(tf('base', 'laser', 0, 0, { x: Math.SQRT1_2, y: 0, z: 0, w: Math.SQRT1_2 })), 'laser', 'base', 0, [1, 2], [1, 0])
+// Quaternions that are not normalized, and what is none.
+goes(told(tf('map', 'base', 0, 0, { x: 0, y: 0, z: 7, w: 7 })), 'base', 'map', 0, [1, 0], [0, 1])
+for (const bad of [tf('map', 'base', 0, 0, {}), tf('map', 'base', 0, 0, { x: 0, y: 0, z: 0, w: 0 }), tf('map', 'base', null, 0, turn(0)), tf('map', 'base', 1e9, 0, turn(0)),
+  tf('map', 'base', 0, 0, { x: 1e200, y: 0, z: 0, w: 1 }), tf('base', '/base', 0, 0, turn(0)), tf('', 'base', 0, 0, turn(0)), null, 5, [], { child_frame_id: {} }]) {
+  const found = told(bad)
+  assert.match(found.problem, /transform that is none/)
+  assert.equal(found.frames.size, 0)
+}
+for (const bad of [null, [], {}, { transforms: 'x' }, { transforms: { length: 3 } }]) assert.throws(() => new Transforms().take(bad), /no transforms/)
+// Absent parents, circles, chains without end.
+assert.throws(() => tree.between('laser', 'moon', 0), /no way from laser to moon: it ends at map and at moon/)
+assert.throws(() => told(tf('a', 'b', 0, 0, turn(0)), tf('b', 'a', 0, 0, turn(0))).between('a', 'map', 0), /circle/)
+const chain = told(...Array.from({ length: 400 }, (_, each) => tf(`f${each + 1}`, `f${each}`, 1, 0, turn(0))))
+assert.throws(() => chain.between('f0', 'f400', 0), /more than 100 frames/)
+// Between two samples, and outside of them.
+const turning = told(tf('map', 'base', 0, 0, turn(0), 10), tf('map', 'base', 2, 0, quarter, 12))
+goes(turning, 'base', 'map', 11, [1, 0], [1 + Math.SQRT1_2, Math.SQRT1_2])
+goes(turning, 'base', 'map', 5, [1, 0], [1, 0])
+goes(turning, 'base', 'map', 99, [1, 0], [2, 1])
+goes(turning, 'base', 'map', 0, [1, 0], [2, 1])
+goes(told(tf('map', 'base', 0, 0, turn(3), 10), tf('map', 'base', 0, 0, { x: 0, y: 0, z: -Math.sin(1.6), w: -Math.cos(1.6) }, 12)), 'base', 'map', 11,
+  [1, 0], [Math.cos(3.1), Math.sin(3.1)])
+turning.take({ transforms: [tf('map', 'base', 5, 0, turn(0), 1)] }, false) // the clock was set back
+goes(turning, 'base', 'map', 11, [0, 0], [5, 0])
+// Old ones end, static ones do not; what there is of them is bounded.
+turning.take({ transforms: [tf('base', 'laser', 1, 0, turn(0))] }, true)
+now = 11
+assert.throws(() => turning.between('laser', 'map', 0), /ends at base/)
+goes(turning, 'laser', 'base', 0, [0, 0], [1, 0])
+const flood = new Transforms(() => now)
+for (let each = 0; each < 20; each++) flood.take({ transforms: Array.from({ length: 2000 }, (_, one) => tf('map', `n${each}-${one}`, 0, 0, turn(0))) }, false)
+assert.equal(flood.frames.size, 500)
+assert.match(flood.problem, /more than 500/)
+now = 30
+flood.take({ transforms: [tf('map', 'new', 1, 0, turn(0))] }, false)
+goes(flood, 'new', 'map', 0, [0, 0], [1, 0])
+for (let each = 0; each < 1000; each++) flood.take({ transforms: [tf('map', 'new', 1, 0, turn(0), each + 1)] }, false)
+assert.equal(flood.frames.get('new').samples.length, 200)
+goes(told(tf('map', '__proto__', 1, 0, turn(0))), '__proto__', 'map', 0, [0, 0], [1, 0])
+// What is drawn by them.
+now = 0
+const place = tree.between('laser', 'map', 0)
+assert.deepEqual(at({ grid: map, scan: { frame: 'laser', points }, tf: { scan: { place } } }), [10, 2.5])
+const drawn = arranged({ grid: map, pose: { ...robot, frame: 'odom' }, tf: { pose: { place: tree.between('odom', 'map', 0) } } })
+assert.deepEqual([drawn.pose.x, drawn.pose.y, drawn.notes], [11, 2, []])
+assert.match(notes({ grid: map, scan: { frame: 'laser', points }, tf: { scan: { problem: 'TF has no way.' } } }), /laser.*not drawn. TF has no way/)
 
 // The viewport: what is under the pointer stays there, and nothing leaves what can be drawn.
-const place = (view, right, down) => [view.x + right / view.scale, view.y - down / view.scale]
+const below = (view, right, down) => [view.x + right / view.scale, view.y - down / view.scale]
 const zoomedIn = zoomed(START, 2, 30, -40)
-place(zoomedIn, 30, -40).forEach((value, index) => near(value, place(START, 30, -40)[index]))
+below(zoomedIn, 30, -40).forEach((value, index) => near(value, below(START, 30, -40)[index]))
 assert.equal(zoomedIn.scale, START.scale * 2)
 assert.deepEqual(panned(START, 50, 0), { x: -1, y: 0, scale: 50 })
 assert.deepEqual(fitted([], 100, 100), START)

@@ -1,5 +1,7 @@
-// How a grid, a pose and a scan lie together. Their frames are compared by name: no transforms (TF)
-// are applied, and what that means for the drawing is said.
+// How a grid, a pose and a scan lie together: by transforms (TF) where they are bridged. Without them
+// frames are compared by name, and what that means for the drawing is said.
+
+import { moved, withoutSlash } from './transforms.js'
 
 export const OLD = 3000 // ms after which a pose or a scan is drawn as an old one
 
@@ -14,26 +16,47 @@ export function placed(points, { x, y, yaw }) {
   return found
 }
 
-/** What is drawn of the parts: {frame, points or null, notes}. */
-export function arranged({ grid, pose, scan }) {
-  const frame = nameOf(grid ?? pose ?? scan)
-  const notes = []
-  if (grid && pose && nameOf(pose) !== frame) {
-    notes.push(`The pose is in the frame ${nameOf(pose)}, the map in ${frame}. Transforms (TF) are not applied: `
-      + 'the robot is drawn as if both were the same.')
+/**
+ * What is drawn of the parts: {frame, pose or null, points or null, notes}. `tf` says of pose and scan where they are in
+ * that frame, see map-link.js; it is undefined where no transforms are bridged.
+ */
+export function arranged({ grid, pose: told, scan, tf }) {
+  const frame = nameOf(grid ?? told ?? scan)
+  const notes = tf?.problem ? [tf.problem] : []
+  const why = (part) => (tf ? tf[part]?.problem ?? '' : 'Transforms (TF) are not bridged.')
+  let pose = told ?? null
+  if (pose && nameOf(pose) !== frame) {
+    if (tf?.pose?.place) pose = movedPose(pose, tf.pose.place)
+    else {
+      notes.push(`The pose is in the frame ${nameOf(pose)}, the map in ${frame}. ${why('pose')} The robot is drawn as if `
+        + 'both were the same.')
+    }
   }
   if (pose && pose.yaw === null) notes.push('The pose has no heading: its quaternion is none.')
-  if (!scan || nameOf(scan) === frame) return { frame, points: scan?.points ?? null, notes }
+  if (!scan || nameOf(scan) === frame) return { frame, pose, points: scan?.points ?? null, notes }
+  if (tf?.scan?.place) return { frame, pose, points: movedPoints(scan.points, tf.scan.place), notes }
   if (!pose || pose.yaw === null) {
     notes.push(`The scan is in the frame ${nameOf(scan)}, and nothing says where that is in ${frame}: it is not drawn. `
-      + 'Transforms (TF) are not applied; a pose with a heading would do.')
-    return { frame, points: null, notes }
+      + `${why('scan')} A pose with a heading would do.`)
+    return { frame, pose, points: null, notes }
   }
-  if (nameOf(scan) !== withoutSlash(pose.child)) {
-    notes.push(`The scan is in the frame ${nameOf(scan)}. Transforms (TF) are not applied: it is drawn as if the sensor `
-      + 'were in the robot’s middle and looked ahead.')
+  if (nameOf(scan) !== withoutSlash(pose.child ?? '')) {
+    notes.push(`The scan is in the frame ${nameOf(scan)}. ${why('scan')} It is drawn as if the sensor were in the robot’s `
+      + 'middle and looked ahead.')
   }
-  return { frame, points: placed(scan.points, pose), notes }
+  return { frame, pose, points: placed(scan.points, pose), notes }
+}
+
+function movedPose(pose, place) {
+  const [x, y] = moved(place, pose.x, pose.y)
+  const yaw = pose.yaw === null ? null : pose.yaw + Math.atan2(place.c, place.a)
+  return { ...pose, x, y, yaw: yaw === null ? null : Math.atan2(Math.sin(yaw), Math.cos(yaw)) }
+}
+
+function movedPoints(points, place) {
+  const found = new Float32Array(points.length)
+  for (let at = 0; at < points.length; at += 2) found.set(moved(place, points[at], points[at + 1]), at)
+  return found
 }
 
 /** The corners of a grid, x and y one after the other. */
@@ -44,9 +67,4 @@ export function corners(grid) {
 
 function nameOf(part) {
   return withoutSlash(part?.frame ?? '') || '(without a name)'
-}
-
-/** ROS 1's names may begin with a slash. */
-function withoutSlash(name) {
-  return name.startsWith('/') ? name.slice(1) : name
 }

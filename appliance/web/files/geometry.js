@@ -1,6 +1,7 @@
 // What is drawn on a map: a grid, a pose and points, from messages of strangers. All in metres and
 // radians (REP 103). Raises an Error that says what is wrong.
 
+import { stampOf } from './transforms.js'
 import { field, numberAt, textAt } from './values.js'
 
 export const MOST_CELLS = 4096 * 4096
@@ -46,11 +47,11 @@ export function pixelsOf({ cells }) {
   return new Uint8ClampedArray(pixels.buffer)
 }
 
-/** Where a robot is: {frame, child, x, y, yaw}; of Odometry and of a pose, with covariance or not. */
+/** Where a robot is: {frame, stamp, child, x, y, yaw}; of Odometry and of a pose, with covariance or not. */
 export function poseOf(message) {
   const outer = field(message, 'pose')
   const found = pose2d(field(outer, 'pose') ?? outer)
-  return { frame: textAt(message, 'header', 'frame_id'), child: textAt(message, 'child_frame_id'), ...found }
+  return { frame: textAt(message, 'header', 'frame_id'), stamp: stampOf(message), child: textAt(message, 'child_frame_id'), ...found }
 }
 
 /** The part of a pose in the plane; `yaw` is null where the quaternion is none. */
@@ -65,7 +66,7 @@ function pose2d(pose) {
   return { x, y, yaw }
 }
 
-/** The points of a sensor_msgs/LaserScan in its frame: {frame, points: x and y one after the other}. */
+/** The points of a sensor_msgs/LaserScan in its frame: {frame, stamp, points: x and y one after the other}. */
 export function scanOf(message) {
   const ranges = field(message, 'ranges')
   if (!Array.isArray(ranges)) throw new Error('no distances in its field ranges')
@@ -81,7 +82,7 @@ export function scanOf(message) {
     const angle = first + at * step
     points.add(range * Math.cos(angle), range * Math.sin(angle))
   }
-  return { frame: textAt(message, 'header', 'frame_id'), points: points.list() }
+  return { frame: textAt(message, 'header', 'frame_id'), stamp: stampOf(message), points: points.list() }
 }
 
 const FLOATS = { 7: ['getFloat32', 4], 8: ['getFloat64', 8] } // sensor_msgs/PointField
@@ -105,7 +106,7 @@ export function cloudOf(message) {
     const at = Math.floor(number / width) * row + (number % width) * step
     points.add(readX(at), readY(at))
   }
-  return { frame: textAt(message, 'header', 'frame_id'), points: points.list() }
+  return { frame: textAt(message, 'header', 'frame_id'), stamp: stampOf(message), points: points.list() }
 }
 
 function reader(message, name, step, view, isLittle) {

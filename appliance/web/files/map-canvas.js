@@ -53,7 +53,8 @@ export class MapCanvas {
       this.bitmap?.close()
       this.bitmap = bitmap
     }
-    if (this.follows && parts.pose) this.view = { ...this.view, x: parts.pose.x, y: parts.pose.y }
+    const { pose } = arranged(parts)
+    if (this.follows && pose) this.view = { ...this.view, x: pose.x, y: pose.y }
     else if (!this.isMoved && (isFirst || bitmap)) this.fit()
     this.draw()
   }
@@ -65,8 +66,8 @@ export class MapCanvas {
   }
 
   fit() {
-    const { grid, pose } = this.parts
-    const { points } = arranged(this.parts)
+    const { grid } = this.parts
+    const { pose, points } = arranged(this.parts)
     const all = [...(grid ? corners(grid) : points ?? []), ...(pose ? [pose.x, pose.y] : [])]
     this.view = fitted(all, this.canvas.clientWidth, this.canvas.clientHeight)
     this.isMoved = false
@@ -152,7 +153,7 @@ export class MapCanvas {
     const toPixels = (x, y) => [width / 2 + (x - view.x) * scale, height / 2 - (y - view.y) * scale]
     context.setTransform(1, 0, 0, 1, 0, 0)
     const isOld = ({ at }) => Date.now() - at > OLD
-    const { points } = arranged(parts)
+    const { pose, points } = arranged(parts)
     if (points) {
       context.fillStyle = isOld(parts.scan) ? colour('--dim') : '#e02424'
       const size = 3 * sharp
@@ -161,7 +162,7 @@ export class MapCanvas {
         if (x > -size && y > -size && x < width && y < height) context.fillRect(x - size / 2, y - size / 2, size, size)
       }
     }
-    if (parts.pose) this.paintRobot(context, parts.pose, toPixels, Math.max(0.25 * scale, 11 * sharp), isOld(parts.pose))
+    if (pose) this.paintRobot(context, pose, toPixels, Math.max(0.25 * scale, 11 * sharp), isOld(pose))
     this.paintScale(context, colour, sharp, scale, height)
   }
 

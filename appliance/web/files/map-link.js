@@ -2,19 +2,33 @@
 // longer than the page may stand still.
 
 import { cloudOf, gridOf, pixelsOf, poseOf, scanOf } from './geometry.js'
+import { Transforms, withoutSlash } from './transforms.js'
 import { valueOf } from './values.js'
 import { Watch } from './watch-link.js'
 
 const RATES = { grid: 1, pose: 10, scan: 5 } // messages a second
+const MOST_WAITING = 500 // messages of TF, each of which may tell of other frames
 
 export default class MapView {
-  /** `topics` is of grid, pose and scan those that are wanted; `isCloud` for a scan of PointCloud2. */
-  constructor(open, { topics, isCloud }) {
+  /**
+   * `topics` is of grid, pose and scan those that are wanted; `isCloud` for a scan of PointCloud2. `tf` are the topics
+   * with transforms: [topic, whether they are static] each.
+   */
+  constructor(open, { topics, isCloud, tf = [] }) {
+    this.transforms = tf.length ? new Transforms() : null
+    this.told = [] // of TF: what is to be read
+    this.known = {} // of each part its frame and time
     this.readers = { grid: gridOf, pose: poseOf, scan: isCloud ? cloudOf : scanOf }
     this.newest = {}
     const parts = Object.keys(RATES).filter((part) => topics[part])
     const wanted = parts.map((part) => [topics[part], RATES[part]])
+    wanted.push(...tf.map(([topic]) => [topic, 0]))
     this.watch = new Watch(open, wanted, (topic, payload, properties, at) => {
+      const transform = tf.find(([name]) => name === topic)
+      if (transform) {
+        this.told.push({ payload, properties, isStatic: transform[1] })
+        if (this.told.length > MOST_WAITING) this.told.shift()
+      }
       for (const part of parts) {
         if (topics[part] === topic) this.newest[part] = { payload, properties, at }
       }
@@ -39,10 +53,36 @@ export default class MapView {
           delete read.cells
         }
         told.parts[part] = { at, problem: '', ...read }
+        this.known[part] = { frame: withoutSlash(read.frame), stamp: read.stamp ?? 0 }
       } catch (error) {
         told.parts[part] = { at, problem: String(error?.message ?? error).slice(0, 200) }
       }
     }
+    if (this.transforms) told.tf = await this.placements()
     return told
+  }
+
+  /** Where pose and scan are in the frame of the map: of each what `between` tells, or a problem. */
+  async placements() {
+    const { transforms, known } = this
+    transforms.problem = ''
+    for (const { payload, properties, isStatic } of this.told.splice(0)) {
+      try {
+        transforms.take(await valueOf(payload, properties), isStatic)
+      } catch (error) {
+        transforms.problem = `A message of TF could not be read: ${String(error?.message ?? error).slice(0, 200)}`
+      }
+    }
+    const found = { problem: transforms.problem }
+    const target = (known.grid ?? known.pose ?? known.scan)?.frame
+    for (const part of ['pose', 'scan']) {
+      if (!known[part] || known[part].frame === target) continue
+      try {
+        found[part] = { place: transforms.between(known[part].frame, target, known[part].stamp) }
+      } catch (error) {
+        found[part] = { problem: error.message }
+      }
+    }
+    return found
   }
 }

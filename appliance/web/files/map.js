@@ -16,11 +16,21 @@ const PARTS = [
   ['pose', 'Pose', /^(nav_msgs(\/msg)?\/Odometry|geometry_msgs(\/msg)?\/PoseStamped|geometry_msgs(\/msg)?\/PoseWithCovarianceStamped)$/],
   ['scan', 'Scan', /^sensor_msgs(\/msg)?\/(LaserScan|PointCloud2)$/],
 ]
+const TF = /^(tf2_msgs(\/msg)?\/TFMessage|tf\/tfMessage)$/
+const MOST_TF = 8 // topics
 const NONE = '-' // which is no MQTT topic of a route
 
 /** Of each part the routes that carry it. */
 function found() {
   return Object.fromEntries(PARTS.map(([part, , types]) => [part, routesOf(robots.value, ({ type }) => types.test(type))]))
+}
+
+/** The topics with transforms of the robots that these topics are of: [topic, whether they are static] each. */
+function transformsOf(topics) {
+  const wanted = Object.values(topics)
+  const of = [...robots.value].filter(([, { routes }]) => (routes ?? []).some((route) => wanted.includes(route?.mqtt)))
+  return routesOf(new Map(of), (route) => TF.test(route.type) && isRead(route))
+    .slice(0, MOST_TF).map(({ mqtt, ros }) => [mqtt, /static$/.test(ros)])
 }
 
 const isRead = ({ encoding }) => encoding === 'json' || encoding === 'cbor'
@@ -44,6 +54,7 @@ export default function MapPage() {
       PoseWithCovarianceStamped) or a scan (LaserScan, PointCloud2) is known. They may not be bridged, or this user may not
       read {robot}/_appliance/routes.</p>`
   }
+  const tf = transformsOf(topics)
   return html`<h1>Map</h1>
     <div class="choices">${PARTS.map(([part, label]) => html`
       <label key=${part}>${label} <select value=${topics[part] ?? NONE} disabled=${routes[part].length === 0}
@@ -52,10 +63,10 @@ export default function MapPage() {
         ${routes[part].map(({ mqtt }) => html`<option key=${mqtt} value=${mqtt}>${mqtt}</option>`)}</select></label>`)}
     </div>
     ${obstacles.map((obstacle) => html`<p class="notice bad" role="alert">${obstacle}</p>`)}
-    <${View} key=${JSON.stringify(topics)} topics=${topics} isCloud=${isCloud} />`
+    <${View} key=${JSON.stringify([topics, tf])} topics=${topics} isCloud=${isCloud} tf=${tf} />`
 }
 
-function View({ topics, isCloud }) {
+function View({ topics, isCloud, tf }) {
   const canvas = useRef(null)
   const map = useRef(null)
   const seen = useRef({ reason: '', parts: {}, problems: {} })
@@ -77,18 +88,19 @@ function View({ topics, isCloud }) {
       map.current.end()
     }
   }, [])
-  useWatch(Object.keys(topics).length ? { kind: 'map', topics, isCloud } : null, ({ reason, parts, bitmap }) => {
+  useWatch(Object.keys(topics).length ? { kind: 'map', topics, isCloud, tf } : null, ({ reason, parts, tf: places, bitmap }) => {
     const now = seen.current
     now.reason = reason
     for (const [part, told] of Object.entries(parts)) {
       now.problems[part] = told.problem
       if (!told.problem) now.parts = { ...now.parts, [part]: told }
     }
+    if (places) now.parts = { ...now.parts, tf: places }
     map.current.show(now.parts, bitmap)
   })
   const { reason, parts, problems } = seen.current
-  const { frame, notes } = arranged(parts)
-  const { grid, pose, scan } = parts
+  const { frame, pose, notes } = arranged(parts)
+  const { grid, scan } = parts
   const turn = () => {
     map.current.follow(!follows)
     follow(!follows)

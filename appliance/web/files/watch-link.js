@@ -5,7 +5,7 @@ export const PACKET = 17 * 1024 * 1024 // a picture has at most 16 MiB
 const REFUSED = new Set([0x86, 0x87, 0x8a]) // bad user name or password, not authorized, banned
 
 export class Watch {
-  /** Each of `wanted` is [topic, messages a second]; `take` gets each message, and keeps what it wants. */
+  /** Each of `wanted` is [topic, messages a second, 0 for all]; `take` gets each message, and keeps what it wants. */
   constructor(open, wanted, take) {
     this.reason = ''
     this.isOver = false
@@ -21,7 +21,7 @@ export class Watch {
     client.on('connect', () => {
       say('')
       for (const [topic, rate] of wanted) {
-        const properties = { userProperties: { 'max-rate': String(rate) } }
+        const properties = rate ? { userProperties: { 'max-rate': String(rate) } } : {}
         client.subscribe(topic, { qos: 0, properties }, (error, granted, packet) => {
           const code = packet?.granted?.[0] ?? (error ? 0x80 : 0)
           if (code >= 0x80) say(refusal(topic, code))
