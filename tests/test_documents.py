@@ -200,3 +200,11 @@ def test_programs_of_the_tests_run(tmp_path: Path) -> None:
     }
     told = {name: process.communicate()[0] for name, process in processes.items()}
     assert {name: told[name] for name, each in processes.items() if each.returncode != 0} == {}
+
+
+def test_nobody_is_sent_to_an_index_where_we_are_not() -> None:
+    """The name is not taken there: whoever takes it would be installed on robots."""
+    asked = re.compile(r"pip install[^.\n]*ros-mqtt-appliance")
+    sources = [path.read_text() for path in (PROJECT / "appliance").rglob("*.py")]
+    texts = [*sources, *(page.text for page in PAGES), (PROJECT / "appliance.yaml").read_text()]
+    assert [found for text in texts for found in asked.findall(text)] == []

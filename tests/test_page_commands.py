@@ -49,7 +49,7 @@ NOT_RUN = {
     "appliance bench --upstream --messages 1000000": "takes ten minutes; tests/bench has its parts",
     "scp dist/appliance robot:": "needs another computer",
     "python3.12 -m venv --system-site-packages ~/appliance"
-    " && ~/appliance/bin/pip install ros-mqtt-appliance": "needs Python 3.12 and a network",
+    " && ~/appliance/bin/pip install .": "needs Python 3.12 and a network",
     "apt install python3-rospy python3-diagnostic-msgs python3-geometry-msgs": "changes the system"
     " and needs a network; .ci/run installs these packages",
     "/usr/bin/python3 -m venv --system-site-packages ~/appliance/venv": "is for the next line",

@@ -138,8 +138,9 @@ def _advice(source: str, sourced: Sourced | None, choice: str | None) -> str:
         python = f"python{_dotted(sourced.python)}"
         fits = (
             f"{sourced} cannot be used by this appliance, which has Python "
-            f"{_dotted(sys.version_info[:2])}. To use it: {python} -m venv --system-site-packages "
-            "~/appliance && ~/appliance/bin/pip install ros-mqtt-appliance"
+            f"{_dotted(sys.version_info[:2])}. To use it, in the folder of the appliance's "
+            f"sources: {python} -m venv --system-site-packages ~/appliance && "
+            "~/appliance/bin/pip install ."
         )
         if source == "none" or choice == "system":
             return fits
@@ -152,7 +153,8 @@ def _advice(source: str, sourced: Sourced | None, choice: str | None) -> str:
     if source == "none":
         return (
             "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
-            "or, on x86-64 Linux, pip install 'ros-mqtt-appliance[ros]'"
+            "or, on x86-64 Linux, install the appliance with one: pip install '.[ros]' in the "
+            "folder of its sources"
         )
     return ""
 

@@ -59,8 +59,8 @@ PNG_LEVEL = 1
 
 #: What a reader has to have installed.
 MISSING = (
-    "needs Pillow: pip install 'ros-mqtt-appliance[camera]', or Debian's python3-pil where the "
-    "environment has the computer's packages"
+    "needs Pillow: pip install Pillow in the appliance's environment, or Debian's python3-pil "
+    "where that has the computer's packages"
 )
 
 
