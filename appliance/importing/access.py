@@ -65,8 +65,8 @@ class _Converter:
 
     def convert(self) -> Access:
         anonymous = {index: self._is_anonymous(each) for index, each in enumerate(self._listeners)}
-        passwords = self._one_of("password_file", "users.passwd")
-        rules = self._one_of("acl_file", "acl.conf")
+        passwords = self._one_of("password_file")
+        rules = self._one_of("acl_file")
         users, names = self._users(passwords)
         acl = self._acl(rules, anonymous)
         if not names and not all(anonymous.values()):
@@ -92,20 +92,10 @@ class _Converter:
         security = self._configuration.security(listener)
         return security.flag("allow_anonymous", self._configuration.local_only)
 
-    def _one_of(self, option: str, ours: str) -> Statement | None:
-        """The file that counts: of several listeners' the first one, as there is one here."""
-        configuration = self._configuration
-        blocks = [configuration.security(each) for each in self._listeners]
-        found = [named for each in blocks if (named := each.get(option)) is not None]
-        for other in found:
-            if other.value != found[0].value:
-                text = (
-                    f"there is one {ours} for all listeners, and it is made of that in "
-                    f"{found[0].place}: this one is not carried over; add what it has that is "
-                    "meant for everybody"
-                )
-                self._notes.add(other.place, option, text, to_do=True)
-        return found[0] if found else None
+    def _one_of(self, option: str) -> Statement | None:
+        """The file that counts; listeners that name another one are not among these."""
+        blocks = [self._configuration.security(each) for each in self._listeners]
+        return next((named for each in blocks if (named := each.get(option)) is not None), None)
 
     def _users(self, statement: Statement | None) -> tuple[str, list[str]]:
         if statement is None:
@@ -124,9 +114,8 @@ class _Converter:
             except ValueError as error:
                 self._notes.add(place, "a user", f"left out: {error}", to_do=True)
                 continue
-            if user in lines:
-                self._notes.add(place, f"user {user!r}", "is there twice: the first one counts")
-                continue
+            if lines.pop(user, None) is not None:
+                self._notes.add(place, f"user {user!r}", "is there twice: the last one counts")
             try:
                 check_hash(stored, user)
             except ValueError as error:
@@ -157,7 +146,23 @@ class _Converter:
                 [(Place(path.name, each.line), each.message) for each in error.problems]
             ) from None
         rules = rules if rules.endswith("\n") else f"{rules}\n"
+        rules = self._without_control(rules, path.name)
         return self._with_anonymous(rules, statement, anonymous)
+
+    def _without_control(self, text: str, name: str) -> str:
+        """The rules without those on $CONTROL, which were about mosquitto's plugins.
+
+        Here they would give the right to manage the appliance.
+        """
+        kept: list[str] = []
+        for number, line in enumerate(text.splitlines(keepends=True), 1):
+            words = line.split()
+            if words[:1] in (["topic"], ["pattern"]) and words[-1].upper().startswith("$CONTROL"):
+                why = "is left out: on $CONTROL the appliance is managed, docs/management.md"
+                self._notes.add(Place(name, number), line.strip(), why)
+                line = f"# {line}"
+            kept.append(line)
+        return "".join(kept)
 
     def _with_anonymous(self, text: str, rules: Statement, anonymous: dict[int, bool]) -> str:
         """The rules, of which those for anonymous clients are of the listeners that have some."""
@@ -174,10 +179,8 @@ class _Converter:
                 continue
             if named is None:
                 free.append(index)
-            elif named.value == rules.value:
-                own.append(index)
             else:
-                self._refuse(index, anonymous, "has another acl_file")
+                own.append(index)
         if not free:
             return text
         if own or self._plugin is not None:
@@ -236,3 +239,9 @@ def _without_anonymous(text: str) -> str:
         if not (is_before and words[:1] == ["topic"]):
             kept.append(line)
     return "".join(kept)
+
+
+def named_in(acl: str) -> set[str]:
+    """The users that the rules name."""
+    lines = (line.split(None, 1) for line in acl.splitlines())
+    return {words[1].strip() for words in lines if len(words) == 2 and words[0] == "user"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,8 +44,13 @@ class _Rule:
     remote: str
 
 
-def convert(bridges: list[Bridge], robot: str, directory: Path, notes: Notes) -> list[Link]:
-    """The links. Raises ImportProblemsError for bridges that mosquitto refuses as well."""
+def convert(
+    bridges: list[Bridge], robot: str, directory: Path, notes: Notes, users: Collection[str]
+) -> list[Link]:
+    """The links; their users are none of these.
+
+    Raises ImportProblemsError for bridges that mosquitto refuses as well.
+    """
     links = []
     names: set[str] = set()
     for bridge in bridges:
@@ -54,15 +60,19 @@ def convert(bridges: list[Bridge], robot: str, directory: Path, notes: Notes) ->
         names.add(name)
         if bridge.every(*_LEFT_OUT):
             continue
-        link = _link(bridge, name, robot, directory, notes)
+        user = f"upstream-{name}"
+        while user in users:
+            user += "-link"
+        link = _link(bridge, name, user, robot, directory, notes)
         if link is not None:
             links.append(link)
     return links
 
 
-def _link(bridge: Bridge, name: str, robot: str, directory: Path, notes: Notes) -> Link | None:
+def _link(
+    bridge: Bridge, name: str, user: str, robot: str, directory: Path, notes: Notes
+) -> Link | None:
     rules = [_parse(statement) for statement in bridge.every("topic")]
-    user = f"upstream-{name}"
     found: dict[str, Any] = {"name": name, "servers": _servers(bridge)}
     kind = kind_of_host(_hosts(bridge)[0][0])
     if kind is not None:
@@ -202,6 +212,8 @@ def _tls(bridge: Bridge, directory: Path, notes: Notes) -> dict[str, Any]:
             text = f"there is no file {statement.value} here that can be read: put it there, and "
             text += f"name it as tls.{key} of the link"
             notes.add(statement.place, option, text, to_do=True)
+            if key == "ca":  # without it any certificate of the public CAs would do
+                found[key] = str((directory / statement.value).absolute())
         else:
             found[key] = str(path.absolute())
     alpn = bridge.get("bridge_alpn")

@@ -68,7 +68,8 @@ def import_mosquitto(path: Path, robot: str) -> Imported:
             [(place, "no listener can be carried over"), *((n.place, n.text) for n in notes.found)]
         )
     who = access.convert(configuration, kept, directory, notes)
-    links = bridges.convert(configuration.bridges, robot, directory, notes)
+    users = {*who.names, *access.named_in(who.acl)}
+    links = bridges.convert(configuration.bridges, robot, directory, notes, users)
     broker: dict[str, Any] = {
         "listeners": [
             listeners.section(listener, who.by_listener.get(index), notes)

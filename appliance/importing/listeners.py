@@ -33,7 +33,63 @@ def carried(configuration: Configuration, notes: Notes) -> list[Listener]:
             notes.add(listener.place, "certfile", text, to_do=True)
         elif not reasons:  # these are noted as all options without a counterpart
             kept.append(listener)
-    return kept
+    return [each for each in kept if not _is_apart(each, kept, configuration, notes)]
+
+
+#: What says whom a certificate lets in, and the files of users and rules: one for all listeners.
+_BY_CERTIFICATE = (
+    "cafile",
+    "capath",
+    "crlfile",
+    "use_identity_as_username",
+    "use_subject_as_username",
+)
+_BY_FILES = ("password_file", "acl_file")
+
+
+def _is_apart(
+    listener: Listener, kept: list[Listener], configuration: Configuration, notes: Notes
+) -> bool:
+    """Whether the listener lets in others, or gives them other rights, than one before it. It is
+    left out then: with that one's settings it could let in whom mosquitto keeps out."""
+    if listener.flag("require_certificate"):
+        first = next(each for each in kept if each.flag("require_certificate"))
+        for option in _BY_CERTIFICATE:
+            if _value(listener, option) != _value(first, option):
+                _leave_out(listener, first, option, notes)
+                return True
+    if not configuration.per_listener:
+        return False
+    for option in _BY_FILES:
+        first = next((each for each in kept if each.get(option) is not None), listener)
+        if listener.get(option) is not None and _value(listener, option) != _value(first, option):
+            _leave_out(listener, first, option, notes)
+            return True
+    return False
+
+
+def _value(listener: Listener, option: str) -> str | bool | None:
+    statement = listener.get(option)
+    if statement is None:
+        return None
+    if option.startswith("use_"):
+        return statement.flag or None
+    return statement.value
+
+
+def _leave_out(listener: Listener, first: Listener, option: str, notes: Notes) -> None:
+    statement = listener.get(option) or first.get(option)
+    assert statement is not None
+    text = (
+        f"{listener} is left out: it is not the same for {first}, and the appliance has one for "
+        "all listeners; add the listener to broker.listeners if that is what is meant"
+    )
+    notes.add(
+        listener.place if listener.get(option) is None else statement.place,
+        option,
+        text,
+        to_do=True,
+    )
 
 
 def section(listener: Listener, anonymous: bool | None, notes: Notes) -> dict[str, Any]:
@@ -118,29 +174,23 @@ def _add_file(
         text = f"there is no file {statement.value} here that can be read: put it there, and name "
         text += f"it as broker.tls.{key}{made}"
         notes.add(statement.place, statement.name, text, to_do=True)
+        if key == "crl":  # without the file nothing starts: with it some might be kept out
+            found[key] = str((directory / statement.value).absolute())
         return
     found[key] = str(path.absolute())
 
 
 def _username(secure: list[Listener], notes: Notes) -> dict[str, Any]:
     required = [each for each in secure if each.flag("require_certificate")]
-    by_identity = [each for each in required if each.flag("use_identity_as_username")]
     for listener in secure:
         if listener not in required:
             statement = listener.get("use_identity_as_username")
             if statement is not None and statement.flag:
                 text = "counts only with require_certificate, which this listener has not"
                 notes.add(statement.place, statement.name, text)
-    if not by_identity:
-        return {}
-    for listener in required:
-        if listener not in by_identity:
-            text = (
-                f"{listener}: broker.tls.username_from is one for all listeners, so that here, "
-                "too, a certificate names the user"
-            )
-            notes.add(listener.place, "use_identity_as_username", text)
-    return {"username_from": "subject"}
+    # All of them say the same, see `carried`.
+    by_identity = any(each.flag("use_identity_as_username") for each in required)
+    return {"username_from": "subject"} if by_identity else {}
 
 
 def without_counterpart(block: Block, notes: Notes) -> None:

@@ -224,13 +224,17 @@ class WebSocketLayer(MiddleLayer):
     @contained("websocket.lost")
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended, from either side."""
+        self._free_frames()
+        self._protocol.connection_lost(exc)
+
+    def _free_frames(self) -> None:
+        """Break the circles of what the library keeps; nothing is received any more."""
         frames = self._frames
         # The library's parser is a generator that refers to its owner, and so do the stack frames
         # of an exception: circles, which would be kept with what was received.
         frames.parser.close()
         _forget_traceback(frames.parser_exc)
         _forget_traceback(frames.handshake_exc)
-        self._protocol.connection_lost(exc)
 
     # --- towards the protocol ------------------------------------------------------------------
 

@@ -124,4 +124,5 @@ class WebSocketClient(WebSocketLayer):
         if closed is not None:
             reason = f"{int(closed.code)} {closed.reason}".strip()
             self._protocol.log_refusal("the broker has closed the WebSocket", reason)
+        self._free_frames()
         cast(UpstreamTransport, self._protocol).connection_lost(exc)
