@@ -58,7 +58,7 @@ def convert(
         while name in names:
             name += "-2"
         names.add(name)
-        if bridge.every(*_LEFT_OUT):
+        if bridge.named(*_LEFT_OUT):
             continue
         user = f"upstream-{name}"
         while user in users:
@@ -72,7 +72,7 @@ def convert(
 def _link(
     bridge: Bridge, name: str, user: str, robot: str, directory: Path, notes: Notes
 ) -> Link | None:
-    rules = [_parse(statement) for statement in bridge.every("topic")]
+    rules = [_parse(statement) for statement in bridge.named("topic")]
     found: dict[str, Any] = {"name": name, "servers": _servers(bridge)}
     kind = kind_of_host(_hosts(bridge)[0][0])
     if kind is not None:

@@ -29,7 +29,7 @@ def limits(configuration: Configuration, notes: Notes) -> dict[str, Any]:
     for statement in configuration.general.statements:
         _limit(statement, found, notes)
     _connections(configuration, found, notes)
-    aliases = [each for block in configuration.listeners for each in block.every("max_topic_alias")]
+    aliases = [each for block in configuration.listeners for each in block.named("max_topic_alias")]
     if aliases:
         found["topic_alias"] = min(max(max(each.number for each in aliases), 0), 65535)
         if len({each.number for each in aliases}) > 1:
@@ -123,14 +123,14 @@ def sys_interval(configuration: Configuration) -> dict[str, Any]:
 
 def log(configuration: Configuration, notes: Notes) -> dict[str, Any]:
     """The section `log`."""
-    for statement in configuration.general.every("log_dest"):
+    for statement in configuration.general.named("log_dest"):
         if statement.value.split()[0] not in ("stderr", "stdout", "syslog"):
             text = (
                 "the log goes to standard error, which systemd's journal keeps: see "
                 "journalctl -u appliance, or appliance log"
             )
             notes.add(statement.place, "log_dest", text)
-    types = configuration.general.every("log_type")
+    types = configuration.general.named("log_type")
     if not types:
         return {}
     said = {each.value for each in types}

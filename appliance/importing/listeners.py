@@ -21,7 +21,7 @@ def carried(configuration: Configuration, notes: Notes) -> list[Listener]:
     kept = []
     for listener in configuration.listeners:
         protocol = listener.get("protocol")
-        reasons = listener.every(*_LEFT_OUT)
+        reasons = listener.named(*_LEFT_OUT)
         if protocol is not None and protocol.value == "http_api":
             text = f"{listener} is left out: the appliance's HTTP is `protocol: web`, docs/http.md"
             notes.add(protocol.place, "protocol", text)

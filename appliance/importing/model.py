@@ -20,13 +20,13 @@ class Block:
 
     statements: list[Statement] = field(default_factory=list)
 
-    def every(self, *names: str) -> list[Statement]:
+    def named(self, *names: str) -> list[Statement]:
         """All statements of these names."""
         return [each for each in self.statements if each.name in names]
 
     def get(self, *names: str) -> Statement | None:
         """The last statement of these names."""
-        found = self.every(*names)
+        found = self.named(*names)
         return found[-1] if found else None
 
     def flag(self, name: str, default: bool = False) -> bool:
@@ -85,7 +85,7 @@ class Configuration:
     def plugin(self) -> Statement | None:
         """A plugin, if there is one."""
         blocks = (self.general, *self.listeners)
-        return next((found for block in blocks for found in block.every(*PLUGINS)), None)
+        return next((found for block in blocks for found in block.named(*PLUGINS)), None)
 
 
 def assemble(statements: Iterable[Statement], name: str, notes: Notes) -> Configuration:
@@ -177,7 +177,7 @@ class _Sorter:
 
     def _set_default_address(self) -> None:
         default = self._default
-        for statement in default.every("port", "bind_address"):
+        for statement in default.named("port", "bind_address"):
             default.place = statement.place
             if statement.name == "bind_address":
                 default.host = statement.value
