@@ -149,6 +149,9 @@ goes(turning, 'base', 'map', 99, [1, 0], [2, 1])
 goes(turning, 'base', 'map', 0, [1, 0], [2, 1])
 goes(told(tf('map', 'base', 0, 0, turn(3), 10), tf('map', 'base', 0, 0, { x: 0, y: 0, z: -Math.sin(1.6), w: -Math.cos(1.6) }, 12)), 'base', 'map', 11,
   [1, 0], [Math.cos(3.1), Math.sin(3.1)])
+turning.take({ transforms: [tf('map', 'base', 7, 7, turn(0), 11)] }, false) // it comes late: what is newer holds
+goes(turning, 'base', 'map', 11, [1, 0], [1 + Math.SQRT1_2, Math.SQRT1_2])
+goes(turning, 'base', 'map', 99, [1, 0], [2, 1])
 turning.take({ transforms: [tf('map', 'base', 5, 0, turn(0), 1)] }, false) // the clock was set back
 goes(turning, 'base', 'map', 11, [0, 0], [5, 0])
 // Old ones end, static ones do not; what there is of them is bounded.

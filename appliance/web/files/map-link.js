@@ -17,6 +17,7 @@ export default class MapView {
   constructor(open, { topics, isCloud, tf = [] }) {
     this.transforms = tf.length ? new Transforms() : null
     this.told = [] // of TF: what is to be read
+    this.toldOnce = [] // and of what is static: nobody tells it again, so that /tf must not push it out
     this.known = {} // of each part its frame and time
     this.readers = { grid: gridOf, pose: poseOf, scan: isCloud ? cloudOf : scanOf }
     this.newest = {}
@@ -26,8 +27,9 @@ export default class MapView {
     this.watch = new Watch(open, wanted, (topic, payload, properties, at) => {
       const transform = tf.find(([name]) => name === topic)
       if (transform) {
-        this.told.push({ payload, properties, isStatic: transform[1] })
-        if (this.told.length > MOST_WAITING) this.told.shift()
+        const told = transform[1] ? this.toldOnce : this.told
+        told.push({ payload, properties, isStatic: transform[1] })
+        if (told.length > MOST_WAITING) told.shift()
       }
       for (const part of parts) {
         if (topics[part] === topic) this.newest[part] = { payload, properties, at }
@@ -66,7 +68,7 @@ export default class MapView {
   async placements() {
     const { transforms, known } = this
     transforms.problem = ''
-    for (const { payload, properties, isStatic } of this.told.splice(0)) {
+    for (const { payload, properties, isStatic } of [...this.toldOnce.splice(0), ...this.told.splice(0)]) {
       try {
         transforms.take(await valueOf(payload, properties), isStatic)
       } catch (error) {

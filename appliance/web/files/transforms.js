@@ -43,7 +43,9 @@ export class Transforms {
     }
     // With another parent, or from a clock that was set back, what was before says nothing.
     const stamp = stampOf(message)
-    const goesOn = known && known.parent === parent && !isStatic && !known.isStatic && stamp >= known.samples.at(-1).stamp
+    const behind = known ? known.samples.at(-1).stamp - stamp : 0
+    const goesOn = known && known.parent === parent && !isStatic && !known.isStatic && behind <= AGE
+    if (goesOn && behind > 0) return // it comes late, and newer ones are known
     const samples = goesOn ? known.samples : []
     samples.push({ stamp, at: this.clock(), ...place })
     if (samples.length > HISTORY) samples.shift()
