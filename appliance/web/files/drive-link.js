@@ -12,6 +12,7 @@ export class Drive {
     this.open = open
     this.route = null
     this.client = null
+    this.parting = null // the connection before, until its stop message is acknowledged
     this.driver = '' // the client id of the connection that drove last
     this.timer = null
     this.state = 'idle'
@@ -71,7 +72,8 @@ export class Drive {
       this.reason = 'The page did not answer; stopped.'
       return
     }
-    if (!this.client?.connected || this.unanswered >= UNANSWERED) return
+    // The connection before commands until it has gone: of two, one would be refused.
+    if (!this.client?.connected || this.parting !== null || this.unanswered >= UNANSWERED) return
     this.state = 'driving'
     this.driver = this.client.options.clientId
     this.publish(...this.wanted)
@@ -126,8 +128,16 @@ export class Drive {
   }
 
   goodbye(client) {
-    const late = setTimeout(() => client.end(true), GOODBYE)
-    client.end(false, {}, () => clearTimeout(late))
+    this.parting = client
+    const parted = () => {
+      clearTimeout(late)
+      if (this.parting === client) this.parting = null
+    }
+    const late = setTimeout(() => {
+      client.end(true)
+      parted()
+    }, GOODBYE)
+    client.end(false, {}, parted)
   }
 
   leave() {
