@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 from raw_client import RawClient
 from service.supervisor import NotifySocket, Supervised
 from waiting import eventually
@@ -73,16 +74,35 @@ def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
     assert said[-1] == {"STOPPING": "1", "STATUS": "stopping"}
 
 
+#: Has the event loop wait for good at the first client. A process that SIGSTOP holds is no such
+#: one: its threads go on with SIGCONT, and walking the frames of a thread that runs can crash.
+HANGING = """\
+import time
+from amqtt.plugins.base import BasePlugin
+
+class Hanging(BasePlugin):
+    async def on_broker_client_connected(self, **_):
+        time.sleep(3600)
+"""
+
+
 def test_a_hung_one_leaves_all_threads_tracebacks(tmp_path: Path) -> None:
+    (tmp_path / "hanging.py").write_text(HANGING)
     with NotifySocket() as notify:
-        _hang(tmp_path, notify)
+        _hang(tmp_path / "house", notify)
 
 
-def _hang(tmp_path: Path, notify: NotifySocket) -> None:
-    appliance = Supervised(tmp_path)
+def _hang(house: Path, notify: NotifySocket) -> None:
+    appliance = Supervised(house)
     appliance.supervise(notify, WATCHDOG)
+    appliance.environment["PYTHONPATH"] = str(house.parent)
+    config = yaml.safe_load(appliance.config.read_text())
+    config.setdefault("broker", {})["plugins"] = {"hanging.Hanging": {}}
+    appliance.config.write_text(yaml.safe_dump(config))
     appliance.start()
-    assert appliance.hang() == -signal.SIGABRT
+    with RawClient(appliance, 5, tls=True) as client:
+        client.socket.sendall(client.connect_packet("any"))
+        assert appliance.watch() == -signal.SIGABRT
     appliance.start()
     try:
         (line,) = appliance.wait_for_log("the last run crashed on .*Fatal Python error: Aborted")
@@ -91,10 +111,10 @@ def _hang(tmp_path: Path, notify: NotifySocket) -> None:
     finally:
         appliance.stop()
     report = path.read_text()
-    assert path.parent == tmp_path / "state/crashes" and path.stat().st_mode & 0o777 == 0o600
-    # Of the event loop and of the store: the signal comes to any thread of a stopped process, also
-    # to one that is none of Python's, so that which one is called the current proves nothing.
+    assert path.parent == house / "state/crashes" and path.stat().st_mode & 0o777 == 0o600
+    # Of the event loop, and where it hangs, and of the store.
     assert "robot: r2d2" in report and report.count("hread 0x") > 1
+    assert 'hanging.py", line' in report
     assert 'appliance/app/main.py", line' in report and 'store/writer.py", line' in report
     assert list(path.parent.iterdir()) == [path], "nothing else is left by a clean end"
 

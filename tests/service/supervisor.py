@@ -89,11 +89,21 @@ class Supervised(ApplianceProcess):
     def hang(self) -> int:
         """SIGSTOP; then the watchdog notices, and does what systemd does."""
         os.kill(self.pid, signal.SIGSTOP)
-        while time.monotonic() < self.notify.last("WATCHDOG") + self.watchdog:
-            time.sleep(0.01)
+        self._wait_for_silence()
         os.kill(self.pid, signal.SIGABRT)
         os.kill(self.pid, signal.SIGCONT)
         return self.ended()
+
+    def watch(self) -> int:
+        """The watchdog alone: for an appliance that hangs by itself."""
+        self._wait_for_silence()
+        os.kill(self.pid, signal.SIGABRT)
+        return self.ended()
+
+    def _wait_for_silence(self) -> None:
+        """As long as systemd waits, which counts from READY=1 on."""
+        while time.monotonic() < self.watchdog + max(map(self.notify.last, ("READY", "WATCHDOG"))):
+            time.sleep(0.01)
 
     def terminate(self) -> int:
         """SIGTERM."""
