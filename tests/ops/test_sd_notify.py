@@ -99,12 +99,12 @@ def _hang(house: Path, notify: NotifySocket) -> None:
     config = yaml.safe_load(appliance.config.read_text())
     config.setdefault("broker", {})["plugins"] = {"hanging.Hanging": {}}
     appliance.config.write_text(yaml.safe_dump(config))
-    appliance.start()
-    with RawClient(appliance, 5, tls=True) as client:
-        client.socket.sendall(client.connect_packet("any"))
-        assert appliance.watch() == -signal.SIGABRT
-    appliance.start()
     try:
+        appliance.start()
+        with RawClient(appliance, 5, tls=True) as client:
+            client.socket.sendall(client.connect_packet("any"))
+            assert appliance.watch() == -signal.SIGABRT
+        appliance.start()
         (line,) = appliance.wait_for_log("the last run crashed on .*Fatal Python error: Aborted")
         path = Path(line.rpartition(" ")[2])
         assert notify.all("STATUS")[-1].endswith(f"; began after a crash, see {path}")

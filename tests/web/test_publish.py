@@ -172,7 +172,11 @@ class Listener:
         self._executor.add_node(self._node)
         self._heard: list[tuple[str, Any]] = []
         for name, kind in types.items():
-            self._node.create_subscription(kind, f"/{name}", partial(self._hear, name), 10)
+            topic = self._node.create_subscription(kind, f"/{name}", partial(self._hear, name), 10)
+            deadline = time.monotonic() + PATIENCE
+            while not topic.get_publisher_count():  # what is sent before they match is lost
+                assert time.monotonic() < deadline, f"nobody publishes on /{name}"
+                self._executor.spin_once(timeout_sec=0.1)
 
     def _hear(self, name: str, message: Any) -> None:
         self._heard.append((name, message))
