@@ -161,12 +161,12 @@ class FloodCell(LoadCell):
 
     @contextlib.contextmanager
     def ours(self, site: Site) -> Iterator[Side]:
-        with peers.appliance(site, [], os.environ, default_limits=True) as server:
+        with peers.appliance(site, [], os.environ, default_queues=True) as server:
             yield LoadSide(server, self.load, self.tls)
 
     @contextlib.contextmanager
     def peer(self, site: Site, command: str) -> Iterator[Side]:
-        with peers.mosquitto(command, site, default_limits=True) as server:
+        with peers.mosquitto(command, site, default_queues=True) as server:
             yield LoadSide(server, self.load, self.tls)
 
 

@@ -133,7 +133,7 @@ def mosquitto(
     command: str,
     site: Site,
     *,
-    default_limits: bool = False,
+    default_queues: bool = False,
     window: int = INFLIGHT,
     bridge: str = "",
 ) -> Iterator[Server]:
@@ -162,7 +162,7 @@ persistence false
 log_dest stderr
 log_type error
 log_type warning
-{"" if default_limits else queues}
+{"" if default_queues else queues}
 listener {port} 127.0.0.1
 listener {tls_port} 127.0.0.1
 certfile {site.directory / "server.crt"}
@@ -184,13 +184,13 @@ def appliance(
     environment: Mapping[str, str],
     durability: str = "off",
     *,
-    default_limits: bool = False,
+    default_queues: bool = False,
     upstreams: Sequence[Mapping[str, object]] = (),
 ) -> Iterator[Server]:
     """Run this appliance, with a bridge when there are routes, and stop it in the end.
 
-    Its limits are raised, unless it is to have the default ones. Links log in at the fleet's broker
-    with the password file `fleet.password`. Raises PeerError.
+    Its limits are raised, but for those of a client's queue where these are to be the default ones.
+    Links log in at the fleet's broker with the password file `fleet.password`. Raises PeerError.
     """
     directory = Path(tempfile.mkdtemp(prefix="appliance-", dir=site.directory))
     passwords = Passwords(directory / "users.passwd")
@@ -216,7 +216,7 @@ def appliance(
                 "ca": str(site.ca),
                 "client_certificates": "off",
             },
-            "limits": {} if default_limits else {"inflight": INFLIGHT, **LIMITS},
+            "limits": LIMITS if default_queues else {"inflight": INFLIGHT, **LIMITS},
             "store": {"durability": durability},
         },
         "bridge": {"bus": "ros2" if routes else "none", "topics": [dict(item) for item in routes]},
