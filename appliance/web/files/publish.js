@@ -45,7 +45,7 @@ export default function Publish({ topic }) {
         ${toRos.map(({ mqtt, type }) => html`<option key=${mqtt} value=${mqtt}>${mqtt} (${type})</option>`)}</select></label>
       <form class="tools" onSubmit=${open}><input name="topic" aria-label="Topic" placeholder="or any topic" autocapitalize="none"
         spellcheck=${false} required maxlength="65535" pattern="[^+#]*"
-        title="The name of a topic, without wildcards (+ and #)" value=${topic} key=${topic} /><button class="plain">Open</button></form>
+        title="The name of a topic, without wildcards (+ and #)" defaultValue=${topic} key=${topic} /><button class="plain">Open</button></form>
     </div>
     ${topic && html`<${Message} key=${topic} topic=${topic} route=${routes.find(({ mqtt }) => mqtt === topic)} />`}`
 }
