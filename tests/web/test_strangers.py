@@ -89,7 +89,7 @@ def test_what_is_being_typed_stays(visit: Callable[..., Visit], stranger: Peer) 
     """The page is drawn anew when a robot says something of its routes."""
     page = visit(**DESKTOP).sign_in(page="Publish")
     page.fill("input[name=topic]", "half/of/a/na")
-    told = FORGED[:1] + [{**FORGED[0], "mqtt": "other/new"}]
+    told = [*FORGED[:1], {**FORGED[0], "mqtt": "other/new"}]
     stranger.publish("other/_appliance/routes", json.dumps(told), retain=True)
     page.wait_for_selector("option[value='other/new']", state="attached")
     assert page.input_value("input[name=topic]") == "half/of/a/na"
