@@ -6,6 +6,7 @@ import contextlib
 import json
 import re
 import signal
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -235,13 +236,18 @@ def test_a_browser_that_hangs(
     assert processes
     for process in processes:
         process.send_signal(signal.SIGSTOP)
+    frozen = time.monotonic()
     try:
         odometry.stands()
+        eventually(lambda: time.monotonic() > frozen + 2.5, "what no short interruption takes")
     finally:
         for process in processes:
             process.send_signal(signal.SIGCONT)
+    page.wait_for_selector(".hint:text-is('Hold to drive')")  # the button is still held
+    before = odometry.count
+    eventually(lambda: odometry.count > before + 5, "odometry")
+    assert odometry.speed == 0
     page.mouse.up()
-    odometry.stands()
 
 
 def test_a_route_that_would_not_stop(visit: Callable[..., Visit], odometry: Odometry) -> None:

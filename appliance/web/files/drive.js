@@ -11,6 +11,7 @@ const html = htm.bind(h)
 const TWIST = /^geometry_msgs(\/msg)?\/Twist(Stamped)?$/
 const CAUTIOUS = { 'linear.x': 0.2, 'angular.z': 0.5 } // m/s and rad/s where the route has no clamp
 const DEAD_MAN = [4, 5] // the gamepad's shoulder buttons
+const FROZEN = 2000 // ms without a beat, of ten a second: the page, or the whole device, was held up
 
 /**
  * The routes that take a Twist, with what speaks against driving by each. Only those of this robot: who
@@ -153,6 +154,7 @@ class Hold {
     this.setHolding = setHolding
     this.by = ''
     this.parts = [0, 0]
+    this.sent = 0
     this.keys = new Set()
     this.pointer = null
     this.isFree = true // the dead-man button was seen open
@@ -177,6 +179,7 @@ class Hold {
   take(by, forward, left) {
     if (this.by && this.by !== by) return
     if (document.hidden) return
+    if (!this.by) this.sent = Date.now()
     this.by = by
     this.parts = [forward, left]
     this.setHolding(by)
@@ -184,6 +187,12 @@ class Hold {
   }
 
   send() {
+    const now = Date.now() // which counts while a device sleeps
+    if (now - this.sent > FROZEN) {
+      this.release() // whether it is held still, a page that was frozen cannot know
+      return
+    }
+    this.sent = now
     const { route, share } = this.now.current
     const linear = scaled(this.parts[0], route.linear, share)
     const angular = scaled(this.parts[1], route.angular, share)
