@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import signal
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 from appliance_process import ACL, ROBOT, ApplianceProcess
 from hypothesis import settings
+from xdist.scheduler import LoadFileScheduling
 
 # How long an example takes is the computer's matter.
 settings.register_profile("default", deadline=None)
@@ -79,14 +81,44 @@ LONG = (
     "test_page_commands.py",
     "test_durability.py",
     "test_memory.py",
-    "test_old_commands.py",
     "test_peers.py",
 )
+
+#: Files whose tests share nothing that takes long to set up: each test is for any worker.
+APART = ("test_containment.py", "test_page_commands.py", "test_durability.py", "test_memory.py")
+
+
+class Scheduling(LoadFileScheduling):
+    """A file's tests go to one worker: they share what its fixtures set up, if it is not APART."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = super()._split_scope(nodeid)
+        return nodeid if file.endswith(APART) else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling | None:
+    return Scheduling(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     order = {name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: order.get(item.path.name, len(LONG)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Keep all that was collected out of the garbage collector's sight.
+
+    These are millions of objects, which are there to the end. To walk them takes a second: whenever
+    the collector runs, and each time that a test looks for what is left of a connection.
+    """
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 class Escaped(logging.Handler):

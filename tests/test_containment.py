@@ -977,25 +977,30 @@ ELSEWHERE = {
 }
 
 
+#: Minutes of waiting for timers, of which two test workers have the half each.
+PARTS = 2
+
+
 @pytest.mark.timeout(900)
 @pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
-def test_every_entry_in_turn(tmp_path: Path, escaped: list[str], quick: None) -> None:
+@pytest.mark.parametrize("part", range(PARTS))
+def test_every_entry_in_turn(tmp_path: Path, escaped: list[str], quick: None, part: int) -> None:
+    only = os.environ.get("ENTRY")
+    names = only.split(",") if only else sorted(all_entries() - ELSEWHERE.keys())
     with pytest.MonkeyPatch.context() as patch:
         saboteur = Saboteur(patch)
-        uvloop.run(_in_turn(tmp_path, saboteur))
+        uvloop.run(_in_turn(names[part::PARTS], tmp_path, saboteur))
     escaped.clear()
 
 
-async def _in_turn(directory: Path, saboteur: Saboteur) -> None:
+async def _in_turn(names: list[str], directory: Path, saboteur: Saboteur) -> None:
     site = Site(directory)
-    names = sorted(all_entries() - ELSEWHERE.keys())
-    only = os.environ.get("ENTRY")
     problems: list[str] = []
     async with site.stack:
         await site.start()
         await _all_go_on(site, "at the beginning")
         await _all_right(site, "at the beginning")
-        for name in only.split(",") if only else names:
+        for name in names:
             began = time.monotonic()
             try:
                 await asyncio.wait_for(_one(site, saboteur, name), 2 * PATIENCE)
