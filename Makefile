@@ -11,8 +11,9 @@ PYTHON ?= python3
 PORT ?= 8883
 PLAIN_PORT ?= 1883
 WEB_PORT ?= 8443
-WORKERS ?= 3
+WORKERS ?= 4
 BIN := .venv/bin
+INSTALL := $(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt
 INTEROP := tests/interop/mqttjs
 
 # A sourced ROS is used as it is; without one, ROS 2 comes from PyPI.
@@ -26,22 +27,30 @@ TEST_EXTRAS := [ros,test]
 BINARY_EXTRAS := [ros,binary]
 endif
 
-.PHONY: run test compiled binary deb
+.PHONY: run test checks tests-imported compiled binary deb
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) APPLIANCE_WEB_PORT=$(WEB_PORT) \
 	  exec $(BIN)/appliance demo -c run/appliance.yaml
 
-# Most of a test's time is waiting, so three at a time (on two cores); those that compare times come after them, alone.
+# Most of a test's time is waiting, so four at a time (on two cores); those that compare times come after them, alone.
 # Hundreds of processes are started: each of them compiles all its modules where that is not kept.
 test: export PYTHONDONTWRITEBYTECODE =
-test: .venv/test.stamp $(INTEROP)/node_modules
+test:
+	@$(MAKE) --no-print-directory -j3 --output-sync checks tests-imported $(INTEROP)/node_modules
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not timed'
+	$(BIN)/pytest -m timed $$(grep -rlw timed tests --include='test_*.py')
+
+checks: .venv/test.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not timed'
-	$(BIN)/pytest -m timed
+
+# Beside the checks, pytest compiles what it imports, which else each of its workers would do. What fails here fails
+# again in the test run, which says why.
+tests-imported: .venv/test.stamp
+	@$(BIN)/pytest --collect-only -qq >/dev/null 2>&1 || true
 
 compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
@@ -53,18 +62,21 @@ binary: .venv/binary.stamp
 deb: binary
 	@$(BIN)/python -m appliance.packaging.deb dist/appliance
 
-.venv/run.stamp: pyproject.toml constraints.txt
+.venv/bin/pip:
 	@echo "Setting up .venv; the first time this takes a minute or two."
-	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV_OPTIONS) .venv
-	@$(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt -e '.$(RUN_EXTRAS)'
+	@$(PYTHON) -m venv $(VENV_OPTIONS) .venv
+
+.venv/run.stamp: pyproject.toml constraints.txt | .venv/bin/pip
+	@$(INSTALL) -e '.$(RUN_EXTRAS)'
 	@touch $@
 
-.venv/test.stamp: .venv/run.stamp
-	@$(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt -e '.$(TEST_EXTRAS)'
-	@touch $@
+# What tests need has all that `make run` needs.
+.venv/test.stamp: pyproject.toml constraints.txt | .venv/bin/pip
+	@$(INSTALL) -e '.$(TEST_EXTRAS)'
+	@touch .venv/run.stamp $@
 
 .venv/binary.stamp: .venv/run.stamp
-	@$(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt -e '.$(BINARY_EXTRAS)'
+	@$(INSTALL) -e '.$(BINARY_EXTRAS)'
 	@touch $@
 
 # MQTT.js is one of the clients that the tests speak with; without npm those tests are skipped.
