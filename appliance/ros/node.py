@@ -196,7 +196,10 @@ class RosNode(Protocol):
         """The full names of all known nodes on the bus, including this one."""
 
     def topics(self) -> dict[str, list[str]]:
-        """The types of each topic that has an endpoint, including this node's."""
+        """The types of each topic that has an endpoint, including this node's.
+
+        What a remapping of this node leads to has the remapped name, here and in `services`.
+        """
 
     def services(self) -> dict[str, list[str]]:
         """The types of each service that has a server, including this node's.
@@ -240,7 +243,7 @@ class RosNode(Protocol):
         """
 
     def resolve(self, topic: str) -> str:
-        """The topic's name on the bus, after remapping."""
+        """The name on the bus of a topic, or of an action's, after remapping."""
 
     def create_publisher(self, topic: str, type_name: str, qos: QosProfile) -> RosPublisher:
         """Make a publisher of serialized messages. Raises BusError, UnknownTypeError."""

@@ -36,6 +36,7 @@ from appliance.ros.node import (
     TakeBatch,
 )
 from appliance.ros.payload.definitions import PACKED, TypeDescription, UnknownTypeError
+from appliance.ros.remapping import with_own_names
 from appliance.ros.ros1.actions import (
     HIDDEN,
     ActionClients,
@@ -412,11 +413,18 @@ class Ros1Node(FaultContainment):
         return int(rospy.rostime.get_rostime().to_nsec())
 
     def topics(self) -> dict[str, list[str]]:
-        return {
+        found = {
             topic: [self._types[topic]]
             for topic in self._publishers | self._subscribers
             if topic in self._types
         }
+        return self._with_own_names(found)
+
+    def _with_own_names(self, found: dict[str, list[str]]) -> dict[str, list[str]]:
+        if not self._arguments:
+            return found
+        # rospy, too, remaps the topics of an action each by itself, and not the action.
+        return with_own_names(found, self._rospy.names.get_resolved_mappings(), {})
 
     def services(self) -> dict[str, list[str]]:
         found = services_of(self._actions)
@@ -432,7 +440,7 @@ class Ros1Node(FaultContainment):
                 found[service] = [full_name(name, "srv")]
         known = {(service, *nodes) for service, nodes in self._servers.items()}
         self._service_types.evict_others(known)
-        return found
+        return self._with_own_names(found)
 
     def count(self, topic: str) -> tuple[int, int]:
         topic = self._resolve(topic.replace(HIDDEN, "/"))

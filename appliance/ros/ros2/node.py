@@ -37,6 +37,7 @@ from appliance.ros.payload.definitions import (
     import_message,
 )
 from appliance.ros.qos import CALLS
+from appliance.ros.remapping import OF_ACTION, remapped_names, with_own_names
 from appliance.ros.ros2 import fastdds, installation
 from appliance.ros.ros2.loop_subscription import (
     FIRST_TIMED,
@@ -135,6 +136,9 @@ class Ros2Node(FaultContainment):
         self._executor: Any = None
         self._is_event_driven = False
         self._clock: Any = None
+        #: The names on the bus of topics and of services that are remapped, by those used here.
+        self._remapped_topics: dict[str, str] = {}
+        self._remapped_services: dict[str, str] = {}
         #: The scope of the network when the node joined the bus.
         self._scope = NetworkScope.NOBODY
         #: Whether the loop's thread can take messages itself; False once that has failed.
@@ -211,9 +215,24 @@ class Ros2Node(FaultContainment):
             else [],
         )
         self.name = self._node.get_fully_qualified_name()
+        self._find_remapped()
         self._clock = self._node.get_clock()
         self._executor, self._is_event_driven = _new_executor(self._context)
         self._executor.add_node(self._node)
+
+    def _find_remapped(self) -> None:
+        from rclpy.expand_topic_name import expand_topic_name
+
+        node = self._node
+        for name in remapped_names(self._arguments):
+            own = expand_topic_name(name, node.get_name(), node.get_namespace())
+            for known, resolve in (
+                (self._remapped_topics, node.resolve_topic_name),
+                (self._remapped_services, node.resolve_service_name),
+            ):
+                # A rule for another node, and one behind another for the same name, is none.
+                if (resolved := resolve(own)) != own:
+                    known[own] = resolved
 
     def _spin(self, poll: Callable[[], None]) -> None:
         from rclpy.executors import ExternalShutdownException
@@ -293,7 +312,10 @@ class Ros2Node(FaultContainment):
         return {name for name, at in hosts.items() if here and not at <= here}
 
     def topics(self) -> dict[str, list[str]]:
-        return _named(self._node.get_topic_names_and_types())
+        found = _named(self._node.get_topic_names_and_types())
+        if not self._remapped_topics:
+            return found
+        return with_own_names(found, self._remapped_topics, self._remapped_topics)
 
     def services(self) -> dict[str, list[str]]:
         from rclpy.node import NodeNameNonExistentError
@@ -307,17 +329,30 @@ class Ros2Node(FaultContainment):
                 for service, types in named.items():
                     # Two nodes may have services of the same name, also of different types.
                     found[service] = sorted({*found.get(service, ()), *types})
-        return found
+        if not self._remapped_services and not self._remapped_topics:
+            return found
+        return with_own_names(found, self._remapped_services, self._remapped_topics)
 
     def count(self, topic: str) -> tuple[int, int]:
-        if self._arguments:
-            topic = self._node.resolve_topic_name(topic)
+        topic = self.resolve(topic)
         handle = self._node.handle  # the node's own methods would expand and check the name again
         with handle:
             return handle.get_count_publishers(topic), handle.get_count_subscribers(topic)
 
     def resolve(self, topic: str) -> str:
-        return str(self._node.resolve_topic_name(topic)) if self._arguments else topic
+        topic = self._of_remapped_action(topic)
+        return self._remapped_topics.get(topic, topic)
+
+    def _of_remapped_action(self, name: str) -> str:
+        """The name of a topic or service of an action, with the action's remapped.
+
+        ROS remaps the names of actions from Kilted on, and up to Jazzy only those of each of their
+        services and topics; the bridge, which uses these, does both on each.
+        """
+        action, separator, part = name.partition(OF_ACTION)
+        if not separator or action not in self._remapped_topics:
+            return name
+        return f"{self._remapped_topics[action]}{separator}{part}"
 
     def publishers(self, topic: str) -> list[Endpoint]:
         return self._others(self._node.get_publishers_info_by_topic(topic))
@@ -345,6 +380,7 @@ class Ros2Node(FaultContainment):
         on_loop: TakeBatch | None = None,
     ) -> RosSubscription:
         message_class = load_message(type_name)
+        topic = self._of_remapped_action(topic)
         if on_loop is not None and self._takes_on_loop and self._entries is not None:
             try:
                 return self._subscribe_on_loop(message_class, topic, qos, callback, on_loop)
@@ -411,6 +447,7 @@ class Ros2Node(FaultContainment):
 
     def create_client(self, service: str, type_name: str) -> _Ros2Client:
         service_class = import_service(type_name)
+        service = self._of_remapped_action(service)
         with _as_bus_error():
             own = self._node.create_client(service_class, service, qos_profile=_to_rclpy(CALLS))
         return _Ros2Client(self._node, own, service_class)
