@@ -11,6 +11,7 @@ from ros1_world import Node, Python, Ros1Appliance, Run, World
 from waiting import PATIENCE
 
 BRIDGE = {
+    "ros_arguments": ["/greet:=/elsewhere/greet"],
     "topics": [
         {"ros": ["/chatter", "/robot/*", "/many"], "to": "mqtt", "keep": 10000},
         {"ros": "/hear", "to": "ros", "type": "std_msgs/msg/String"},
@@ -27,7 +28,7 @@ BRIDGE = {
         },
     ],
     "services": [
-        "/robot/*",
+        {"ros": ["/robot/*", "/greet", "/elsewhere/*"]},
         {"ros": "/robot/sleep", "timeout": "300 ms"},
         {
             "ros": "/ask_human",

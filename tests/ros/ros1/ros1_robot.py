@@ -5,6 +5,7 @@
 | `/robot/switch` | std_srvs/SetBool | says the contrary |
 | `/robot/sleep` | std_srvs/Trigger | never answers |
 | `/robot/greet` | std_srvs/Trigger | |
+| `/elsewhere/greet` | std_srvs/Trigger | which the bridge calls `/greet` |
 | `/robot/rest` | std_srvs/Empty | |
 | `/robot/fail` | std_srvs/SetBool | fails |
 | `/robot/map` | std_msgs/String | latched |
@@ -47,6 +48,7 @@ class Robot:
         self.publishers = {}
         rospy.Service("/robot/switch", SetBool, lambda asked: SetBoolResponse(not asked.data, "so"))
         rospy.Service("/robot/greet", Trigger, lambda asked: (True, "hello"))
+        rospy.Service("/elsewhere/greet", Trigger, lambda asked: (True, "hello, whoever"))
         rospy.Service("/robot/rest", Empty, lambda asked: ())
         rospy.Service("/robot/fail", SetBool, lambda asked: None)
         rospy.Service("/robot/sleep", Trigger, lambda asked: threading.Event().wait())

@@ -49,6 +49,14 @@ def test_a_service_in_cbor_and_in_ros_bytes(robot: Node, appliance: Ros1Applianc
         assert code == "bad_request" and "truncated" in text
 
 
+def test_a_service_that_is_remapped(robot: Node, appliance: Ros1Appliance) -> None:
+    appliance.wait_for_log("/greet can be called at r2d2/greet/_call")
+    with Mqtt(appliance) as client:
+        answer = client.call("r2d2/greet", {})
+        assert answer == {"success": True, "message": "hello, whoever"}
+    assert "/elsewhere/greet can be called" not in appliance.log
+
+
 def test_a_service_that_fails_stays(robot: Node, appliance: Ros1Appliance) -> None:
     appliance.wait_for_log("/robot/fail can be called")
     with Mqtt(appliance) as client:

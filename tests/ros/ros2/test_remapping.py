@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import time
 
 import pytest
-from waiting import until
+from waiting import PATIENCE, until
 
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
@@ -97,7 +98,9 @@ async def test_all_that_is_remapped_is_carried(harness, robot, peer):
         alice.send("r2d2/cmd", {"linear": {"x": 0.25}})
         return (await alice.call("r2d2/reset/_call"))[1]["message"] == "cmd_vel 0.25"
 
+    deadline = time.monotonic() + PATIENCE
     while not await drives():
+        assert time.monotonic() < deadline
         await asyncio.sleep(0.05)
     assert await alice.call("r2d2/pen/_call", {"data": True}) == (
         "ok",
@@ -112,7 +115,7 @@ async def test_all_that_is_remapped_is_carried(harness, robot, peer):
     await until(lambda: alice.on("r2d2/walk/_status"), "the status")
 
     await until(lambda: harness.retained("r2d2/its/_param/mode") == "calm", "the parameters")
-    assert (await alice.call("r2d2/its/_param/mode/set", '"wild"'.encode()))[0] == "ok"
+    assert (await alice.call("r2d2/its/_param/mode/set", b'"wild"'))[0] == "ok"
 
     asking = asyncio.create_task(asyncio.to_thread(robot.do, "ask", True))
     await until(lambda: [m for m in alice.received if "/ask/_request/" in m.topic], "the request")
@@ -142,8 +145,17 @@ def test_names_of_the_graph_are_the_nodes_own():
     assert with_own_names(found, {}, {}) == found
     # Exchanged, as two arms may be; and /c leads to what is not there.
     assert with_own_names(found, {"/a": "/b", "/b": "/a", "/c": "/d"}, {}) == {
-        **{"/a": 2, "/b": 1, "/act/_action/x": 4, "/on/_action/x": 5, "/action": 6}
+        "/a": 2,
+        "/b": 1,
+        "/act/_action/x": 4,
+        "/on/_action/x": 5,
+        "/action": 6,
     }
     assert with_own_names(found, {}, {"/own": "/act", "/on": "/act"}) == {
-        **{"/a": 1, "/b": 2, "/c": 3, "/own/_action/x": 4, "/on/_action/x": 4, "/action": 6}
+        "/a": 1,
+        "/b": 2,
+        "/c": 3,
+        "/own/_action/x": 4,
+        "/on/_action/x": 4,
+        "/action": 6,
     }
