@@ -39,7 +39,13 @@ from appliance.config.settings import (
     TopicRoute,
     UpstreamSection,
 )
-from appliance.config.values import OF_NODE, InListError, PictureEncoding, ValueEncoding
+from appliance.config.values import (
+    OF_NODE,
+    InListError,
+    PictureEncoding,
+    ValueEncoding,
+    check_robot,
+)
 from appliance.config.yaml_document import ConfigProblem, KeyPath, YamlDocument, dotted
 from appliance.host.environment import of_service
 from appliance.mqtt.topics import check_filter, overlaps
@@ -47,6 +53,8 @@ from appliance.mqtt.topics import check_filter, overlaps
 SEARCH_PATH = (Path("appliance.yaml"), Path("/etc/appliance/appliance.yaml"))
 """Default locations of the configuration; the first file that exists is used."""
 
+#: The environment variable that overrides `robot`: one file serves many robots.
+ROBOT = "APPLIANCE_ROBOT"
 
 #: The largest configuration file, in characters; a longer one is probably another file.
 _MAX_SIZE = 1 << 20
@@ -114,8 +122,14 @@ def load_control(path: Path | None = None) -> Settings:
 
 def loads(text: str, file: Path, environment: Mapping[str, str] | None = None) -> Settings:
     """The settings in `text`; `file` is named in errors; paths are relative to its directory."""
-    document = YamlDocument(text, file, os.environ if environment is None else environment)
+    environment = os.environ if environment is None else environment
+    document = YamlDocument(text, file, environment)
     problems = document.problems
+    if robot := environment.get(ROBOT):
+        try:
+            document.values["robot"] = check_robot(robot)
+        except ValueError as error:
+            problems.append(document.problem(("robot",), f"of {ROBOT}, {robot!r}, {error}"))
     try:
         settings = Settings.model_validate(
             document.values, context={"directory": file.absolute().parent}

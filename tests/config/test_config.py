@@ -439,6 +439,16 @@ def test_lists_of_names_and_patterns() -> None:
     assert config.loads(yaml.safe_dump(text), HERE).bridge.topics[0].ros == ("/a/*", "!/a/b")
 
 
+def test_the_environment_overrides_the_robot(tmp_path: Path) -> None:
+    file = tmp_path / "appliance.yaml"
+    for text in ("robot: r2d2\n", "", "robot: not valid\n"):
+        found = config.loads(text, file, {"APPLIANCE_ROBOT": "r3d3"})
+        assert found.robot == "r3d3"
+    assert config.loads("robot: r2d2", file, {"APPLIANCE_ROBOT": ""}).robot == "r2d2"
+    with pytest.raises(config.ConfigError, match="of APPLIANCE_ROBOT, 'a/b', must be one level"):
+        config.loads("robot: r2d2", file, {"APPLIANCE_ROBOT": "a/b"})
+
+
 def test_ros_arguments() -> None:
     text = 'bridge: {ros_arguments: [--ros-args, -r, "/a:=/b"]}'
     assert loads(text).bridge.ros_arguments == ["-r", "/a:=/b"]
