@@ -1,5 +1,6 @@
 # make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443
 # make test  every check: format, lint, types, import directions, tests
+# make test-kilted  the tests that tell most about a distribution of ROS 2, on Kilted in place of Jazzy
 # make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
 #                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
 # make binary    dist/appliance: one executable with everything in it, for this kind of computer;
@@ -15,6 +16,9 @@ WORKERS ?= 4
 BIN := .venv/bin
 INSTALL := $(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt
 INTEROP := tests/interop/mqttjs
+KILTED := .venv-kilted
+# Own interfaces both ways, services, actions, parameters, QoS, the loop's own subscriptions, losses, discovery, remapping.
+KILTED_TESTS := tests/ros/ros2 tests/ros/payload/test_own_interfaces.py tests/ros/test_robot.py
 
 # A sourced ROS is used as it is; without one, ROS 2 comes from PyPI.
 ifdef ROS_DISTRO
@@ -27,7 +31,7 @@ TEST_EXTRAS := [ros,test]
 BINARY_EXTRAS := [ros,binary]
 endif
 
-.PHONY: run test checks tests-imported compiled binary deb
+.PHONY: run test test-kilted checks tests-imported compiled binary deb
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) APPLIANCE_WEB_PORT=$(WEB_PORT) \
@@ -52,6 +56,9 @@ checks: .venv/test.stamp
 tests-imported: .venv/test.stamp
 	@$(BIN)/pytest --collect-only -qq >/dev/null 2>&1 || true
 
+test-kilted: $(KILTED)/test.stamp
+	$(KILTED)/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not timed' $(KILTED_TESTS)
+
 compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
 
@@ -74,6 +81,14 @@ deb: binary
 .venv/test.stamp: pyproject.toml constraints.txt | .venv/bin/pip
 	@$(INSTALL) -e '.$(TEST_EXTRAS)'
 	@touch .venv/run.stamp $@
+
+# Its versions of ROS 2 take the place of those that constraints.txt has.
+$(KILTED)/test.stamp: pyproject.toml constraints.txt tests/ros/kilted.txt
+	@test -x $(KILTED)/bin/pip || $(PYTHON) -m venv $(KILTED)
+	@grep -v '^ros-' constraints.txt > $(KILTED)/constraints.txt
+	@$(KILTED)/bin/pip install -q --use-pep517 --disable-pip-version-check -c $(KILTED)/constraints.txt -e '.[camera]' \
+	  -r tests/ros/kilted.txt hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist
+	@touch $@
 
 .venv/binary.stamp: .venv/run.stamp
 	@$(INSTALL) -e '.$(BINARY_EXTRAS)'
