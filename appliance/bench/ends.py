@@ -169,7 +169,7 @@ def ros_send(topic: str, rate: float, seconds: float, is_image: bool) -> None:
     """Publish std_msgs/String, or serialized sensor_msgs/Image."""
     import rclpy
 
-    refusal = import_module("rclpy._rclpy_pybind11").RCLError
+    refusal = import_module("rclpy.impl.implementation_singleton").rclpy_implementation.RCLError
     rclpy.init()
     node = rclpy.create_node("bench_send")
     message_type, queue, make = images() if is_image else texts()

@@ -22,7 +22,8 @@ CHOICE = "ROS_FROM"
 
 DEFAULT_RMW = "rmw_fastrtps_cpp"
 
-_EXTENSION = re.compile(r"_rclpy_pybind11\.cpython-(\d)(\d+)")
+#: rclpy's compiled module: `_rclpy_pybind11`, and in Rolling `_rclpy_nanobind`.
+_EXTENSION = re.compile(r"_rclpy_\w+\.cpython-(\d)(\d+)")
 _SITES = ("lib/python3*/site-packages", "local/lib/python3*/dist-packages")
 
 PythonVersion = tuple[int, int]
@@ -101,7 +102,7 @@ def find_sourced(environment: Mapping[str, str]) -> Sourced | None:
     fitting: list[Sourced] = []
     others: list[Sourced] = []
     for site in _sites(environment):
-        for extension in sorted(Path(site, "rclpy").glob("_rclpy_pybind11.*.so")):
+        for extension in sorted(Path(site, "rclpy").glob("_rclpy_*.so")):
             if match := _EXTENSION.match(extension.name):
                 python = int(match[1]), int(match[2])
                 found = Sourced(python, site, environment.get("ROS_DISTRO", ""))

@@ -389,7 +389,7 @@ class Ros2Node(FaultContainment):
                 self._takes_on_loop = False
         events = _event_callbacks().SubscriptionEventCallbacks(use_default_callbacks=False)
         callback = self._contained("ros.message", callback)
-        if timed and not self._is_event_driven:
+        if timed and not self._is_event_driven and _has_message_info():
             callback = _with_time(callback)
         with _as_bus_error():
             own = self._node.create_subscription(
@@ -722,6 +722,13 @@ def _new_executor(context: Any) -> tuple[Any, bool]:
 
         return SingleThreadedExecutor(context=context), False
     return EventsExecutor(context=context), True
+
+
+def _has_message_info() -> bool:
+    """Whether rclpy passes a message's times to callbacks that take them: from ROS 2 Iron on."""
+    from rclpy.subscription import Subscription
+
+    return hasattr(Subscription, "CallbackType")
 
 
 def _with_time(callback: Callable[..., None]) -> Callable[[bytes, Any], None]:

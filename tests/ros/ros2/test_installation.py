@@ -13,13 +13,15 @@ HERE = sys.version_info[:2]
 OTHER = (3, 99)
 
 
-def source(folder, python=HERE, packages=("std_msgs",), distribution="jazzy"):
+def source(
+    folder, python=HERE, packages=("std_msgs",), distribution="jazzy", module="_rclpy_pybind11"
+):
     """A distribution's folder, and the environment after its setup file was sourced."""
     version = f"{python[0]}.{python[1]}"
     site = folder / f"lib/python{version}/site-packages"
     (site / "rclpy").mkdir(parents=True)
     (site / "rclpy/__init__.py").touch()
-    (site / f"rclpy/_rclpy_pybind11.cpython-{version.replace('.', '')}-x86_64-linux-gnu.so").touch()
+    (site / f"rclpy/{module}.cpython-{version.replace('.', '')}-x86_64-linux-gnu.so").touch()
     index = folder / "share/ament_index/resource_index/rosidl_interfaces"
     index.mkdir(parents=True)
     for package in packages:
@@ -44,6 +46,12 @@ def test_a_sourced_ros_is_found_by_pythonpath_or_by_its_prefix(tmp_path):
     del environment["PYTHONPATH"]
     assert find_sourced(environment) == by_path
     assert find_sourced({"AMENT_PREFIX_PATH": f":{tmp_path}/nothing", "PYTHONPATH": ""}) is None
+
+
+def test_rolling_has_another_name_for_the_compiled_module(tmp_path):
+    found = find_sourced(source(tmp_path / "rolling", OTHER, module="_rclpy_nanobind"))
+    assert found is not None
+    assert found.python == OTHER
 
 
 def test_the_sourced_ros_of_the_same_python_is_preferred(tmp_path):

@@ -22,9 +22,12 @@ from appliance.ops.doctor import ros as doctor
 from appliance.ros.bridge import Bridge
 from appliance.ros.ros2 import loop_subscription as ros2_loop
 from appliance.ros.ros2 import node as ros2
+from appliance.ros.ros2.node import Ros2Node
 
 pytest.importorskip("rclpy")
 from appliance_process import ROBOT, ApplianceProcess
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.subscription import Subscription
 from ros2_harness import STRING, Harness, Peer, route, string
 
 from appliance.ros.calls.routes import CallRoutes, ServiceSettings
@@ -51,7 +54,7 @@ async def start():
 
     def start(*routes, diagnostics=0.0, **node):
         harness = Harness()
-        harness.node = ros2.Ros2Node(**node)
+        harness.node = Ros2Node(**node)
         loop = asyncio.get_running_loop()
         harness.bridge = Bridge(
             harness.node, harness.broker, routes, loop, "r2d2", diagnostics=diagnostics
@@ -81,6 +84,38 @@ async def test_messages_come_in_order_and_some_are_timed(start, peer):
     assert 0 < latency.p50 <= latency.p99 < 1000
     (topic,) = harness.bridge.topics()
     assert topic.size == 8
+
+
+@pytest.mark.parametrize("has_times", [True, False])
+async def test_an_executor_without_events(start, peer, monkeypatch, has_times):
+    """Humble, and Jazzy before 7.1.4; in Humble a callback gets nothing but the message."""
+
+    def new_executor(context):
+        return SingleThreadedExecutor(context=context), False
+
+    def set_callback(self, callback):
+        self._callback = callback
+        self._callback_type = Subscription.CallbackType.MessageOnly
+
+    monkeypatch.setattr(ros2, "_new_executor", new_executor)
+    if not has_times:
+        monkeypatch.setattr(ros2, "_has_message_info", lambda: False)
+        humble = property(lambda self: self._callback, set_callback)
+        monkeypatch.setattr(Subscription, "callback", humble)
+    monkeypatch.setattr(Ros2Node, "_subscribe_on_loop", unavailable)
+    harness = start(route("/a", "mqtt", "text", keep=100))
+    await peer.do("advertise", "/a", STRING)
+    await until(harness.bridged, "/a")
+    await peer.do("matched", "/a")
+    for number in range(20):
+        await peer.do("publish", "/a", string(f"{number}").hex())
+    await until(lambda: len(harness.payloads("r2d2/a")) == 20, "all messages")
+    assert harness.bridge.problem is None
+    assert (harness.bridge.status()[0].latency_ms is not None) is has_times
+
+
+def unavailable(*_):
+    raise ros2_loop.UnavailableError("this middleware is another one")
 
 
 async def test_messages_latched_before_are_not_timed(start, peer):
