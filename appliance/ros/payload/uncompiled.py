@@ -4,8 +4,8 @@ The one file needs this: its Python and ROS are hardly ever those that a robot's
 with, so that the compiled support of the workspace does not load. rclpy requires a type support
 even for messages that it carries as bytes. Fast DDS then uses only the name and the hash of the
 type, so that the support of an installed type can serve for another type under that type's name.
-Up to Jazzy it also asks for the type's members, for filters by content, which rclpy has not: they
-go nowhere, and are those of the installed type.
+Up to Jazzy it also asks for the type's members, for filters by content, which are not used here:
+they go nowhere, and are those of the installed type.
 
 Services cannot be bridged this way, as rclpy does not accept or return serialized requests.
 """

@@ -714,7 +714,7 @@ def _as_bus_error(*more: type[Exception]) -> Iterator[None]:
 
 def _new_executor(context: Any) -> tuple[Any, bool]:
     """The best available executor, and whether it is EventsExecutor, which takes an eighth of the
-    CPU time of the others and exists since ROS 2 Jazzy."""
+    CPU time of the others and exists since ROS 2 Jazzy (rclpy 7.1.4)."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
