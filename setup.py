@@ -11,7 +11,7 @@ import os
 import sys
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import Extension, setup
 
 # Not on the way of a message, and left as they are: mypyc takes the `TYPE` of the packet classes
 # for a field of the dataclass; values and the links inside the appliance are subclassed where
@@ -52,27 +52,47 @@ UPSTREAM = (
 )
 
 
-def compiled() -> None:
-    """Set up with the data path compiled: what is pure and typed, and runs for every message."""
+#: What mypy has to see beside the compiled modules, to know the types of all that these import.
+COMPILE_NEEDS = ["mypy[mypyc]>=2.4", "pydantic>=2.10", "types-PyYAML>=6.0.12"]
+
+#: Commands of setuptools that compile nothing: pip asks for what the build needs, then for the
+#: metadata, each in a run of its own; an sdist is the sources.
+WITHOUT_COMPILING = {"egg_info", "dist_info", "sdist"}
+
+
+def extensions() -> list[Extension]:
+    """The data path: what is pure and typed, and runs for every message."""
     try:
         from mypyc.build import mypycify
-    except ImportError:  # pip asks first what the build needs, and comes back with it installed
-        setup(setup_requires=["mypy[mypyc]>=2.4"])
-        return
+    except ImportError as error:
+        needs = " ".join(f"'{need}'" for need in COMPILE_NEEDS)
+        sys.exit(
+            f"setup.py: APPLIANCE_COMPILE=1, and mypyc is not here ({error}): build without "
+            f"--no-build-isolation, or install what compiling needs: pip install {needs}"
+        )
     modules = {*Path("appliance/mqtt").glob("*.py"), *Path("appliance/broker").glob("*.py")}
     modules |= {Path(f"appliance/net/{name}.py") for name in ("connection", "scheduler", "tls")}
     modules |= {Path(f"appliance/upstream/{name}.py") for name in UPSTREAM}
     modules = {module for module in modules if module.name != "__init__.py"} - INTERPRETED
     level = os.environ.get("APPLIANCE_OPTIMIZE", "3")
-    extensions = mypycify(sorted(map(str, modules)), opt_level=level, group_name="appliance")
+    compiled = mypycify(sorted(map(str, modules)), opt_level=level, group_name="appliance")
     if level == "0":  # for who looks whether it works, not how fast it is: two minutes less
-        for extension in extensions:
+        for extension in compiled:
             extension.extra_compile_args += ["-g0", "-DNDEBUG"]
-    setup(ext_modules=extensions)
+    return compiled
 
 
-# pip asks for the metadata first, in a run of its own: they are the same for what is not compiled.
-if os.environ.get("APPLIANCE_COMPILE") == "1" and "dist_info" not in sys.argv:
-    compiled()
-else:
+def is_compiled() -> bool:
+    """Whether machine code was asked for. An answer that is not understood is not a no."""
+    asked = os.environ.get("APPLIANCE_COMPILE", "")
+    if asked not in ("", "0", "1"):
+        sys.exit(f"setup.py: APPLIANCE_COMPILE is 1 for machine code, or 0, and not {asked!r}")
+    return asked == "1"
+
+
+if not is_compiled():
     setup()
+elif WITHOUT_COMPILING.intersection(sys.argv):
+    setup(setup_requires=COMPILE_NEEDS)
+else:
+    setup(ext_modules=extensions())

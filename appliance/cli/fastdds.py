@@ -8,6 +8,8 @@ import typer
 
 #: Smallest and largest segment in bytes: the default, and the most that shared memory allows.
 LEAST, MOST = 512 << 10, 4 << 30
+#: Room for several uncompressed images of a usual camera.
+DEFAULT = "16 MiB"
 
 
 def fastdds(
@@ -16,7 +18,7 @@ def fastdds(
         typer.Option(
             metavar="SIZE", help="Shared memory of each node; several messages should fit."
         ),
-    ] = "16 MiB",
+    ] = DEFAULT,
 ) -> None:
     """Print a Fast DDS profile with more shared memory, for nodes that publish images."""
     from appliance.config import parse_size

@@ -112,9 +112,8 @@ def _version(wanted: bool) -> None:
         except PackageNotFoundError:
             text = "appliance, run from its source without being installed"
         broker = find_spec("appliance.broker.broker")
-        if broker is not None and isinstance(broker.loader, ExtensionFileLoader):
-            text += ", compiled"
-        typer.echo(text)
+        is_compiled = broker is not None and isinstance(broker.loader, ExtensionFileLoader)
+        typer.echo(f"{text}, {'compiled' if is_compiled else 'pure Python'}")
         raise typer.Exit
 
 

@@ -14,17 +14,26 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from datetime import datetime, timezone
 from email.utils import formatdate
 from importlib.metadata import metadata, version
 from pathlib import Path
 
+from appliance.cli.fastdds import DEFAULT as SEGMENT
+from appliance.config import parse_size
 from appliance.ops.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
 from appliance.ops.unit import ENVIRONMENT, VARIABLES, Unit
+from appliance.packaging import completion, manual
+from appliance.ros.ros2 import fastdds
 
 PACKAGE = "appliance"
 DOCUMENTS = Path("/usr/share/doc", PACKAGE)
 PROJECT = Path(__file__).resolve().parents[2]
 SCRIPTS = Path(__file__).parent / "debian"
+#: The pages that README leads to, beside those of docs/.
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "certs/README.md")
+#: What lintian is told to let pass, each with the reason.
+OVERRIDES = Path("/usr/share/lintian/overrides", PACKAGE)
 
 DESCRIPTION = """\
  One process on the robot's computer: an MQTT 3.1.1 and 5 broker with the bridge
@@ -42,9 +51,11 @@ def build(command: Path, directory: Path) -> Path:
         root.chmod(0o755)
         _stage(root, command)
         _documents(root, release)
+        _reference(root, release)
         (root / "DEBIAN").mkdir()
-        for script in SCRIPTS.iterdir():
-            _write(root, Path("/DEBIAN", script.name), script.read_text(), 0o755)
+        for script in ("postinst", "postrm", "prerm"):
+            _write(root, Path("/DEBIAN", script), (SCRIPTS / script).read_text(), 0o755)
+        _write(root, OVERRIDES, (SCRIPTS / "lintian-overrides").read_text())
         _write(root, Path("/DEBIAN/conffiles"), f"{ENVIRONMENT}\n")
         _write(root, Path("/DEBIAN/control"), _control(root, release, architecture))
         directory.mkdir(exist_ok=True)
@@ -80,11 +91,26 @@ def _documents(root: Path, release: str) -> None:
         "  * See CHANGELOG.md.\n\n"
         f" -- {_maintainer()}  {formatdate(_moment())}\n"
     )
-    changes = {"changelog": entry, "CHANGELOG.md": (PROJECT / "CHANGELOG.md").read_text()}
-    for name, text in changes.items():
-        place = root / DOCUMENTS.relative_to("/") / f"{name}.gz"
-        place.write_bytes(gzip.compress(text.encode(), mtime=0))
-        place.chmod(0o644)
+    _compress(root, DOCUMENTS / "changelog.gz", entry)
+    # As they are, and beside each other as in the repository: README leads to the pages.
+    pages = [PROJECT / name for name in PAGES] + sorted(PROJECT.glob("docs/**/*.*"))
+    for page in pages:
+        _write(root, DOCUMENTS / page.relative_to(PROJECT), page.read_text())
+    (root / DOCUMENTS.relative_to("/") / "LICENSE").symlink_to("../../common-licenses/Apache-2.0")
+
+
+def _reference(root: Path, release: str) -> None:
+    """What is looked up at the robot: man pages, completion, the reference configuration."""
+    day = datetime.fromtimestamp(_moment(), timezone.utc).date().isoformat()
+    for name, text in manual.pages(release, day):
+        _compress(root, Path("/usr/share/man/man1", f"{name}.gz"), text)
+    for path, text in completion.scripts().items():
+        _write(root, path, text)
+    configuration = (PROJECT / "appliance.yaml").read_text()
+    _write(root, DOCUMENTS / "examples/appliance.yaml", configuration)
+    (root / DOCUMENTS.relative_to("/") / "appliance.yaml").symlink_to("examples/appliance.yaml")
+    profile = fastdds.profile(parse_size(SEGMENT))
+    _write(root, Path("/usr/share", PACKAGE, "fastdds.xml"), profile)
 
 
 def _control(root: Path, release: str, architecture: str) -> str:
@@ -111,6 +137,11 @@ def _moment() -> float:
         return float(_output_of("git", "-C", str(PROJECT), "log", "-1", "--format=%ct"))
     except (OSError, ValueError, subprocess.CalledProcessError):
         return (PROJECT / "CHANGELOG.md").stat().st_mtime
+
+
+def _compress(root: Path, path: Path, text: str) -> None:
+    _write(root, path, "")
+    (root / path.relative_to("/")).write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
 def _output_of(*command: str) -> str:

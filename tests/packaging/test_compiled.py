@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import venv
 import zipfile
 from pathlib import Path
 
@@ -42,9 +43,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "appliance", source / "appliance")
     for name in ("setup.py", "pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, source)
-    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps"]
+    # By a Python that has nothing installed: mypy would find there what the build has to ask for.
+    bare = directory / "bare"
+    venv.create(bare, with_pip=False)
+    pip = [sys.executable, "-m", "pip", "--python", str(bare / "bin/python"), "wheel", "-q"]
+    options = ["--no-deps", "--use-pep517", "--disable-pip-version-check"]
     subprocess.run(
-        [*pip, "--use-pep517", "--disable-pip-version-check", "-w", str(directory), str(source)],
+        [*pip, *options, "-w", str(directory), str(source)],
         env={**os.environ, "APPLIANCE_COMPILE": "1", "APPLIANCE_OPTIMIZE": "0"},
         check=True,
         timeout=1800,  # on one core that others share
@@ -62,6 +67,9 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
     where = [sys.executable, "-c", WHERE]
     used = subprocess.run(where, env=environment, cwd=compiled, check=True, capture_output=True)
     assert used.stdout.count(b".so") == 3
+    version = [sys.executable, "-m", "appliance", "--version"]
+    told = subprocess.run(version, env=environment, cwd=compiled, check=True, capture_output=True)
+    assert told.stdout.endswith(b", compiled\n")
     pytest_command = Path(sys.executable).with_name("pytest")  # `-m pytest` would import from here
     run = subprocess.run(
         [
