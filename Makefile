@@ -6,6 +6,7 @@
 # make binary    dist/appliance: one executable with everything in it, for this kind of computer;
 #                needs binutils and Python's shared library (apt install binutils libpython3-dev)
 # make deb   dist/appliance_VERSION_ARCHITECTURE.deb of what `make binary` makes, with its service
+# make release   all that a release publishes, in dist/: docs/release.md says what, and what it needs
 # What they install goes to .venv, what they make to run; both can be deleted at any time.
 
 PYTHON ?= python3
@@ -31,7 +32,7 @@ TEST_EXTRAS := [ros,test]
 BINARY_EXTRAS := [ros,binary]
 endif
 
-.PHONY: run test test-kilted checks tests-imported compiled binary deb
+.PHONY: run test test-kilted checks tests-imported compiled binary deb release
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) APPLIANCE_WEB_PORT=$(WEB_PORT) \
@@ -69,6 +70,9 @@ binary: .venv/binary.stamp
 deb: binary
 	@$(BIN)/python -m appliance.packaging.deb dist/appliance
 
+release: .venv/release.stamp
+	@$(BIN)/python -m appliance.packaging.release $(RELEASE_OPTIONS)
+
 .venv/bin/pip:
 	@echo "Setting up .venv; the first time this takes a minute or two."
 	@$(PYTHON) -m venv $(VENV_OPTIONS) .venv
@@ -92,6 +96,10 @@ $(KILTED)/test.stamp: pyproject.toml constraints.txt tests/ros/kilted.txt
 
 .venv/binary.stamp: .venv/run.stamp
 	@$(INSTALL) -e '.$(BINARY_EXTRAS)'
+	@touch $@
+
+.venv/release.stamp: .venv/run.stamp
+	@$(INSTALL) -e '.[release]'
 	@touch $@
 
 # MQTT.js is one of the clients that the tests speak with; without npm those tests are skipped.
