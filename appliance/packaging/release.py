@@ -278,7 +278,10 @@ def main() -> int:
             raise ReleaseError(f"install what this needs: apt install {' '.join(missing)}")
         for machine in machines:
             if machine != native and machine not in cross:
-                raise ReleaseError(f"no compiler for {machine}: apt install gcc-aarch64-linux-gnu")
+                raise ReleaseError(
+                    f"there is no compiler for {machine} here: for aarch64 on another computer, "
+                    "apt install gcc-aarch64-linux-gnu"
+                )
         pythons = [wheels.Python.at(each) for each in options.python] or wheels.pythons_here()
         if not pythons:
             raise ReleaseError("no Python here has its headers: apt install python3-dev")
