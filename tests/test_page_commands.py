@@ -46,7 +46,8 @@ NOT_RUN = {
     " client; tests/cli/test_clients.py disconnects one",
     "make binary": "builds for minutes; tests/packaging/test_binary.py runs what it builds",
     "make deb": "needs what `make binary` builds; tests/ops/test_install.py makes a package",
-    'make release RELEASE_OPTIONS="--python python3.11 --python python3.13 --machine x86_64"': "builds for half an hour; tests/packaging has its parts",
+    'make release RELEASE_OPTIONS="--python python3.11 --python python3.13'
+    ' --machine x86_64"': "builds for half an hour; tests/packaging has its parts",
     "apt install git gcc python3-dev python3-venv lintian": "changes the system",
     "apt install gcc-aarch64-linux-gnu": "changes the system",
     'git tag --annotate v1.2.3 --message "Version 1.2.3"': "makes a release of this repository",
