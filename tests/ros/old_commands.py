@@ -34,6 +34,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
 
 from appliance_process import HOST, MOSQUITTO, ROBOT, ApplianceProcess, free_ports  # noqa: E402
+from ros_domain import DOMAIN  # noqa: E402
 from upstream.relay import Relay  # noqa: E402
 from waiting import PATIENCE, until  # noqa: E402
 
@@ -471,7 +472,7 @@ async def main() -> None:
     parser.add_argument("--only", nargs="*", default=SCENARIOS, choices=SCENARIOS)
     arguments = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", "115")
+    os.environ.setdefault("ROS_DOMAIN_ID", DOMAIN)
     kinds = arguments.clients.split(",")
     print("SCENARIO             CLIENT         MQTT   QOS  SENT  MOVED  OLDEST MS  VERDICT")
     wrong = 0

@@ -3,10 +3,29 @@
 from __future__ import annotations
 
 import os
+import socket
 
 import pytest
 
-DOMAIN = str(1 + os.getpid() % 101)  # above 101 the ports are those of outgoing connections
+#: Above it the ports are those of outgoing connections.
+LAST = 101
+
+
+def _claim() -> tuple[str, socket.socket]:
+    """A domain, and what keeps it for this process until it ends, however it does."""
+    for offset in range(LAST):
+        number = 1 + (os.getpid() + offset) % LAST
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0appliance-tests-ros-domain-{number}")
+        except OSError:  # another worker's, or another run's
+            claim.close()
+        else:
+            return str(number), claim
+    raise RuntimeError(f"each ROS domain from 1 to {LAST} is used by a test run on this computer")
+
+
+DOMAIN, _CLAIM = _claim()
 
 
 @pytest.fixture

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from ros_domain import DOMAIN
 from waiting import until
 
 from appliance.host.environment import for_other_programs
@@ -160,7 +160,7 @@ def test_another_computer_of_the_network():
         if not name.startswith("FASTDDS")
     }
     environment.pop(RANGE, None)
-    environment["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    environment["ROS_DOMAIN_ID"] = DOMAIN
     done = subprocess.run(
         ["unshare", "-n", sys.executable, str(program)],
         capture_output=True,
@@ -182,7 +182,7 @@ async def test_with_security_enforced_and_no_keys_nothing_is_joined(monkeypatch,
     monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
     monkeypatch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
     monkeypatch.setenv("ROS_SECURITY_KEYSTORE", str(tmp_path))
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
+    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
     node, looks, failures = Ros2Node(arguments=("--enclave", "/appliance")), [], []
     node.start(lambda: looks.append(1), failures.append)
     try:
