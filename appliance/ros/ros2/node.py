@@ -299,7 +299,7 @@ class Ros2Node(FaultContainment):
         if not middleware.startswith("rmw_fastrtps"):
             return set()
         hosts: dict[str, set[bytes]] = {}
-        for topic in self.topics():
+        for topic in map(self._of_remapped_action, self.topics()):
             for info in (
                 *self._node.get_publishers_info_by_topic(topic),
                 *self._node.get_subscriptions_info_by_topic(topic),
@@ -355,9 +355,11 @@ class Ros2Node(FaultContainment):
         return f"{self._remapped_topics[action]}{separator}{part}"
 
     def publishers(self, topic: str) -> list[Endpoint]:
+        topic = self._of_remapped_action(topic)
         return self._others(self._node.get_publishers_info_by_topic(topic))
 
     def subscribers(self, topic: str) -> list[Endpoint]:
+        topic = self._of_remapped_action(topic)
         return self._others(self._node.get_subscriptions_info_by_topic(topic))
 
     def _others(self, found: list[Any]) -> list[Endpoint]:
