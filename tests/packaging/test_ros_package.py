@@ -20,7 +20,7 @@ import pytest
 import yaml
 from appliance_process import ApplianceProcess
 from ros_domain import isolated_domain
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance.host.environment import for_other_programs
 
@@ -69,7 +69,7 @@ def colcon(workspace, *arguments):
         env={**for_other_programs(), "PATH": PATH},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=4 * PATIENCE,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
@@ -92,7 +92,7 @@ def run(executable, *arguments, **environment):
         env={"PATH": PATH, "HOME": "/nonexistent", **environment},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
 
@@ -256,7 +256,7 @@ def test_the_manifest_is_valid():
         check=True,
     )
     project = (PROJECT / "pyproject.toml").read_text()
-    (version,) = re.findall(r'^version = "(.*)"$', project, re.MULTILINE)
+    (version,) = re.findall(r'^version = "([^"]+)"', project, re.MULTILINE)
     assert done.stdout.strip() == f"mqtt_appliance {version} ament_python []"
 
 
