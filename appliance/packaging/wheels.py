@@ -112,6 +112,9 @@ def environment(python: Python, machine: str, directory: Path) -> dict[str, str]
     header = directory / folder / "pyconfig.h"
     header.parent.mkdir(parents=True)
     header.write_text(_FOR_ARM64.format(native=python.header))
+    # Told to setuptools alone: pip has to fetch what compiles for this computer.
+    settings = directory / "setup.cfg"
+    settings.write_text(f"[bdist_wheel]\nplat_name = linux_{machine}\n")
     compiler = COMPILERS[machine]
     return {
         **variables,
@@ -119,7 +122,7 @@ def environment(python: Python, machine: str, directory: Path) -> dict[str, str]
         "LDSHARED": f"{compiler} -shared",
         "CFLAGS": f"-I{directory} -include {header}",
         "SETUPTOOLS_EXT_SUFFIX": python.suffix.replace(native, machine),
-        "_PYTHON_HOST_PLATFORM": f"linux-{machine}",  # what sysconfig says, and the wheel's name
+        "DIST_EXTRA_CONFIG": f"{settings}",
     }
 
 
