@@ -215,7 +215,7 @@ class Release:
 
     def _run(self, *command: str | Path, cwd: Path, **variables: str) -> str:
         """Run it, with all that it says in the log; returns its standard output."""
-        environment = {**os.environ, **variables}
+        environment = {**os.environ, **variables, "NO_COLOR": "1"}
         environment["PATH"] = f"{Path(sys.executable).parent}:{environment['PATH']}"
         environment.setdefault("SOURCE_DATE_EPOCH", self._moment())
         with self._log.open("a") as log:
