@@ -51,7 +51,7 @@ class Release:
         native = os.uname().machine
         with self._step("the last commit, in a clone of its own"):
             version = self._clone()
-            self._say(f"version {version}")
+            self._say(f"version {version}; all that is said on the way is in {self._log}")
         with self._step("sdist"):
             sdist = self._sdist()
         with self._step("pure wheel"):
