@@ -72,16 +72,33 @@ def pytest_timeout_set_timer(settings: Any) -> Generator[None, object, object]:
     return done
 
 
-#: The files that take minutes. They go first, or the other workers end up waiting for the last.
+#: The files that take longest, from five minutes to half a one where four run at a time on two
+#: cores. They go first, or the other workers end up waiting for the last.
 LONG = (
     "test_compiled.py",
+    "test_uplink.py",
+    "test_journeys.py",
+    "test_managing.py",
     "test_containment.py",
-    "test_binary.py",
-    "test_bench.py",
     "test_page_commands.py",
+    "test_bench.py",
+    "test_loop_subscription.py",
+    "test_binary.py",
+    "test_publish.py",
+    "test_all_types.py",
+    "test_camera_page.py",
+    "test_brokers.py",
+    "test_dial.py",
+    "test_listeners.py",
+    "test_websocket.py",
+    "test_calls.py",
+    "test_peers.py",
     "test_durability.py",
     "test_memory.py",
-    "test_peers.py",
+    "test_first_looks.py",
+    "test_programs.py",
+    "test_robot.py",
+    "test_long_page.py",
 )
 
 #: Files whose tests share nothing that takes long to set up: each test is for any worker.
