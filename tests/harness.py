@@ -124,6 +124,7 @@ class Harness:
         """However a client leaves that has said this, nothing of its connection is in memory: not
         only when garbage is looked for, which is among young objects alone."""
         gc.collect()
+        gc.freeze()  # what is there already is not looked at again and again
         before = len(_layers())
         gc.disable()
         logging.disable()  # pytest keeps the records, with what is in them
