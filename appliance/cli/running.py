@@ -26,6 +26,13 @@ def init(
             "--demo", help="Add routes for the demo robot, and write the password to a file."
         ),
     ] = False,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="The directory for what it stores when it runs; default: state, in that of --dir.",
+        ),
+    ] = None,
     name: Annotated[
         list[str] | None,
         typer.Option(
@@ -62,6 +69,7 @@ def init(
                 robot=robot,
                 user=user,
                 demo=demo,
+                data=data,
                 names=name or [],
                 upstream=upstream,
                 manufacturer=vda5050,

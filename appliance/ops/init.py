@@ -6,6 +6,7 @@ With a URL of a fleet's broker it adds a link to that, and the access rules that
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import secrets
@@ -52,6 +53,20 @@ bridge:
   #    type: geometry_msgs/msg/Twist
   #    on_silence: {{after: 500 ms, publish: {{}}}}  # who falls silent is followed by a stop
 """
+
+#: What takes the place of these lines where what the appliance writes has a folder of its own.
+_WITH_DATA = {
+    "\nbroker:\n": """
+broker:
+  store: {{path: {store}}}
+""",
+    "\nbridge:\n": """
+control: {control}
+crash_reports: {crashes}
+
+bridge:
+""",
+}
 
 DEMO_CONFIGURATION = """\
 # The demo's configuration, made by `appliance init --demo`. What is left out has a safe default.
@@ -176,21 +191,35 @@ def generate_password() -> str:
     return "".join(secrets.choice(alphabet) for _ in range(_PASSWORD_LENGTH))
 
 
+def with_data(template: str, data: Path, control: Path) -> str:
+    """A first configuration with what the appliance writes in the folder `data`, absolute, and the
+    socket for its commands at `control`."""
+    paths = {"store": data / "store.db", "control": control, "crashes": data / "crashes"}
+    # Quoted for YAML, and with its braces doubled: what comes out is a template, too.
+    quoted = {name: json.dumps(str(path)) for name, path in paths.items()}
+    for line, text in _WITH_DATA.items():
+        more = text.format(**quoted).replace("{", "{{").replace("}", "}}")
+        template = template.replace(line, more, 1)
+    return template
+
+
 def initialise(
     directory: Path,
     *,
     robot: str | None = None,
     user: str = "operator",
     demo: bool = False,
-    configuration: str = CONFIGURATION,
+    data: Path | None = None,
+    control: Path | None = None,
     names: Sequence[str] = (),
     upstream: str | None = None,
     manufacturer: str | None = None,
 ) -> Iterator[InitStep | Credentials | NextSteps]:
     """Create what is missing in `directory`, and yield each step when it is done.
 
-    `configuration` is the text for a missing appliance.yaml, with `{robot}` in it; `names` are DNS
-    names for the server's certificate, in addition to those that this computer knows. `upstream`
+    A new appliance.yaml keeps what the appliance writes in the folder `data`, else in one beside
+    itself, and its `control` socket there, too, unless that has another path. `names` are DNS names
+    for the server's certificate, in addition to those that this computer knows. `upstream`
     is the URL of a fleet's broker to add a link to, which speaks VDA 5050 as a robot of that
     `manufacturer` if there is one.
 
@@ -216,8 +245,11 @@ def initialise(
     directory.mkdir(parents=True, exist_ok=True)
     file = directory / "appliance.yaml"
     name = robot_name(robot or ("demo" if demo else socket.gethostname().partition(".")[0]))
-    text = (DEMO_CONFIGURATION if demo else configuration).format(robot=name)
-    made = write_new(file, text)
+    template = DEMO_CONFIGURATION if demo else CONFIGURATION
+    if data is not None:
+        data = data.absolute()
+        template = with_data(template, data, control or data / "control.sock")
+    made = write_new(file, template.format(robot=name))
     settings = config.load(file)
     if robot and not made and settings.robot != name:
         raise InitError(f"{file} has robot: {settings.robot}; change it there")

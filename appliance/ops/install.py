@@ -18,7 +18,6 @@ from typing import Literal, NamedTuple
 
 from appliance import config
 from appliance.host.environment import for_other_programs
-from appliance.ops.init import CONFIGURATION as CONFIGURATION_TEXT
 from appliance.ops.init import Credentials, InitStep, initialise, robot_name
 from appliance.ops.unit import CONFIGURATION, DATA, ENVIRONMENT, NAME, OWN_USER, VARIABLES, Unit
 
@@ -42,15 +41,8 @@ _TAKEN_OVER = (
     "RMW_IMPLEMENTATION",
 )
 
-#: Where the service keeps what it writes, in the first configuration of `init`.
-_SERVICE_STORE = f"""
-broker:
-  store: {{{{path: {DATA}/store.db}}}}"""
-_SERVICE_PATHS = f"""
-control: /run/appliance/control.sock
-crash_reports: {DATA}/crashes
-
-bridge:"""
+#: Where commands such as `appliance reload` reach the service.
+_CONTROL = Path("/run/appliance/control.sock")
 
 #: The line by which the unit of a single file is recognised.
 _SINGLE_FILE = "NotifyAccess=all"
@@ -368,7 +360,7 @@ class ServiceInstaller:
             yield self._configuration_of_another(place)
             _hand_over(place, account, before)
             return
-        for step in initialise(place, robot=self.robot, configuration=first_configuration()):
+        for step in initialise(place, robot=self.robot, data=DATA, control=_CONTROL):
             if isinstance(step, InitStep):
                 shown = "/" / step.path.relative_to(self.root)
                 yield InstallStep("made" if step.made else "kept", str(shown), step.text)
@@ -562,12 +554,6 @@ def systemd_version() -> int:
         return 0
     words = output.split()
     return int(words[1]) if len(words) > 1 and words[1].isdecimal() else 0
-
-
-def first_configuration() -> str:
-    """The text of a service's first configuration, with `{robot}` in it."""
-    text = CONFIGURATION_TEXT.replace("\nbroker:", _SERVICE_STORE, 1)
-    return text.replace("\nbridge:", _SERVICE_PATHS, 1)
 
 
 def _before(place: Path) -> Path:

@@ -270,6 +270,27 @@ def test_the_demo_keeps_its_password_in_a_file(tmp_path: Path) -> None:
     assert "topic write {robot}/reset/_call/#\n" in (tmp_path / "groups/drivers.conf").read_text()
 
 
+@pytest.mark.parametrize("demo", [False, True])
+def test_what_it_stores_has_a_folder_of_its_own(tmp_path: Path, demo: bool) -> None:
+    data = tmp_path / "kept {here}: #1"
+    list(initialise(tmp_path / "files", robot="r2d2", demo=demo, data=data))
+    settings = config.load(tmp_path / "files/appliance.yaml")
+    assert settings.robot == "r2d2"
+    assert settings.broker.store.path == data / "store.db"
+    assert settings.crash_reports == data / "crashes"
+    assert settings.control == data / "control.sock"
+    assert len(settings.broker.listeners) == 3, "the rest is as it is elsewhere"
+    assert settings.bridge.discovery == "localhost"
+
+
+def test_a_service_has_its_socket_elsewhere(tmp_path: Path) -> None:
+    socket = tmp_path / "run/control.sock"
+    list(initialise(tmp_path, data=tmp_path / "data", control=socket))
+    settings = config.load(tmp_path / "appliance.yaml")
+    assert settings.control == socket
+    assert settings.broker.store.path == tmp_path / "data/store.db"
+
+
 def test_what_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(InitError, match="user name"):
         list(initialise(tmp_path, user="a:b"))

@@ -531,20 +531,6 @@ def test_the_debian_package(tmp_path: Path) -> None:
         subprocess.run(["sh", "-n", raw / "DEBIAN" / name], check=True)
 
 
-def test_the_first_configuration_is_one(tmp_path: Path) -> None:
-    from appliance.ops.install import first_configuration
-
-    made = yaml.safe_load(first_configuration().format(robot="r2d2"))
-    assert made["broker"].keys() == {"store", "listeners"}
-    assert made.keys() == {
-        "robot",
-        "broker",
-        "control",
-        "crash_reports",
-        "bridge",
-    }
-
-
 @as_root
 def test_a_dry_run_of_who_may_not_look(
     image: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
