@@ -1,9 +1,9 @@
 """Every command line of README, CONTRIBUTING and docs/ is run as the page has it.
 
 A page's lines are run by a shell, in the page's order, in a new home folder with an appliance and a
-robot of its own. `NOT_RUN` lists the lines that are not run, each with its reason; every other line
-is run and has to succeed, so that a new line is either run or listed. `STAND_INS` and `ADDED` are
-all that is changed in a line.
+robot of its own. `NOT_RUN` and `NO_PROGRAMS` list the lines that are not run, with their
+reasons; every other line is run and has to succeed, so that a new line is either run or listed.
+`STAND_INS` and `ADDED` are all that is changed in a line.
 """
 
 from __future__ import annotations
@@ -61,6 +61,12 @@ NOT_RUN = {
     " and needs a network; .ci/run installs these packages",
     "/usr/bin/python3 -m venv --system-site-packages ~/appliance/venv": "is for the next line",
     "~/appliance/venv/bin/pip install .": "needs a network",
+}
+
+#: Programs of which no line is run, and why.
+NO_PROGRAMS = {
+    "docker": "needs a Docker engine; tests/container runs the image with podman",
+    "podman": "is run by tests/container, in namespaces of its own",
 }
 
 #: What a line says, and what stands for it here; {port}, {user} and {password} are the appliance's.
@@ -364,6 +370,7 @@ def signing_request() -> bytes:
 @pytest.mark.usefixtures("isolated_domain")
 def test_every_command_of_a_page_does_what_it_says(page: Page, tmp_path: Path) -> None:
     typed = [line for line in lines(page) if line not in NOT_RUN]
+    typed = [line for line in typed if line.split()[0] not in NO_PROGRAMS]
     if not HAS_ROS and any(needs(NEED_ROBOT, line) for line in typed):
         pytest.skip("there is no ROS 2 here")
     if shutil.which("mosquitto_rr") is None and any("mosquitto_" in line for line in typed):
@@ -412,6 +419,7 @@ def test_what_is_not_run_is_in_a_page() -> None:
     every = {line for page in PAGES for line in lines(page)}
     assert len(every) > 50
     assert {*NOT_RUN} - every == set()
+    assert {*NO_PROGRAMS} - {line.split()[0] for line in every} == set()
 
 
 def test_what_stands_for_something_is_needed() -> None:
