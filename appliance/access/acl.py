@@ -13,6 +13,7 @@ from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.topics import check_filter, matches, overlaps, parse_shared
 
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"
+_WILD: Final = "who has + or # in the user name or client id gets nothing from patterns"
 
 # Up to so many rules a linear scan is faster than a search in the tree.
 _FEW: Final = 4
@@ -128,6 +129,8 @@ class _Applied:
         """Why the rule does not apply: the name only where another one could make it match."""
         if self.filter is not None:
             return otherwise
+        if "%" not in self.rule.filter:
+            return _WILD
         levels = self.rule.filter.split("/")
         could = "/".join("+" if name in _NAMES else name for name in levels)
         return _UNFIT if overlaps(could, filter) else otherwise
@@ -184,8 +187,9 @@ class _Received:
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.levels = frozenset(topic.split("/"))
-        #: By user, and by whether the client id cannot be substituted.
-        self.decisions: dict[tuple[str | None, bool], Decision] = {}
+        #: By user, by whether the client id cannot be substituted, and whether that is for a
+        #: wildcard in it.
+        self.decisions: dict[tuple[str | None, bool, bool], Decision] = {}
 
 
 class Acl:
@@ -193,7 +197,8 @@ class Acl:
 
     A client's own rules come first (those of its user, or of anonymous clients), then the patterns;
     within both, rules that deny come first. The first rule that matches and concerns the action
-    decides. Without one, the action is refused.
+    decides. Without one, the action is refused. Patterns give nothing to clients with + or # in a
+    name, whether or not the name is put in, as in mosquitto.
     """
 
     def __init__(
@@ -251,7 +256,7 @@ class Acl:
         is_unfit = _changes_levels(client_id)
         if not is_unfit and client_id in received.levels:  # a rule may name this client
             return self._decide(identity, Action.RECEIVE, topic)
-        who = (identity.username, is_unfit)
+        who = (identity.username, is_unfit, is_unfit and _has_wildcard(client_id))
         decision = received.decisions.get(who)
         if decision is None:
             decision = self._decide(identity, Action.RECEIVE, topic)
@@ -349,8 +354,12 @@ class Acl:
             for rule in own.rules if about is None else own.about(about):
                 yield _Applied(rule, rule.filter)
         patterns = self._patterns
+        is_wild = _has_wildcard(identity.client_id) or _has_wildcard(identity.username or "")
         for rule in patterns.rules if about is None else patterns.about(about):
             if identity.username is None and "%u" in rule.filter:
+                continue
+            if is_wild and not rule.denies:
+                yield _Applied(rule, None)
                 continue
             filter = _substitute(rule.filter, identity)
             # A client named $SYS gets nothing of $SYS from `%c/#`: `$` must be in the file.
@@ -382,9 +391,13 @@ def _substitute(filter: str, identity: Identity) -> str | None:
     return "/".join(levels)
 
 
+def _has_wildcard(name: str) -> bool:
+    return "+" in name or "#" in name
+
+
 def _changes_levels(name: str) -> bool:
     """Whether substituting the name would change the levels of a filter."""
-    return not name or "/" in name or "+" in name or "#" in name
+    return not name or "/" in name or _has_wildcard(name)
 
 
 def _samples(a: str, b: str, depth: int) -> Iterator[str]:

@@ -21,6 +21,7 @@ from appliance.access.scram import METHOD, ScramExchange, Verifier
 from appliance.access.throttle import LoginThrottle, RecentKeys
 from appliance.access.token_file import TokenFile
 from appliance.access.tokens import Token, Tokens, is_token
+from appliance.broker.limits import Anonymous
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.host.addresses import network_prefix
@@ -267,7 +268,7 @@ class FileAccess:
         password: bytes | None,
         client_id: str,
         address: str,
-        anonymous: bool | None = None,
+        anonymous: Anonymous = None,
     ) -> Identity | Refusal:
         """Who the client is, or why it is refused; `address` matters for the throttle only.
 

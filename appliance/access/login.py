@@ -11,6 +11,9 @@ The first of these that applies decides about a CONNECT:
    listener says. A listener that says no has the last word, plugins or not.
 5. **amqtt's plugins**, where some that authenticate are configured.
 
+At a listener whose clients are always anonymous, steps 3 to 5 are left out, and a user name with
+its password means nothing.
+
 SCRAM (enhanced authentication) is step 3 with a proof in the place of the password. It is not
 offered where step 1 has decided already, nor beside plugins that authenticate: it would bypass
 those that refuse the client.
@@ -24,6 +27,7 @@ from typing import Protocol
 
 from appliance.access.files import FileAccess
 from appliance.access.tokens import is_token
+from appliance.broker.limits import Anonymous
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Identity, Refusal
 from appliance.mqtt.codec import quote
@@ -84,7 +88,7 @@ class LoginPolicy:
         connect: Connect,
         address: str,
         tls: ssl.SSLObject | None = None,
-        anonymous: bool | None = None,
+        anonymous: Anonymous = None,
     ) -> Identity | Refusal:
         """Who sent the CONNECT, or why it is refused.
 
@@ -105,7 +109,7 @@ class LoginPolicy:
         password: bytes | None,
         address: str,
         tls: ssl.SSLObject | None = None,
-        anonymous: bool | None = None,
+        anonymous: Anonymous = None,
     ) -> Identity | Refusal:
         """Who somebody is that does not speak MQTT: decided as a CONNECT without a client id.
 
@@ -116,7 +120,7 @@ class LoginPolicy:
         return who
 
     async def _decide(
-        self, connect: Connect, address: str, tls: ssl.SSLObject | None, anonymous: bool | None
+        self, connect: Connect, address: str, tls: ssl.SSLObject | None, anonymous: Anonymous
     ) -> tuple[Identity | Refusal, object]:
         try:
             owner = self._certificate_user(tls) if tls is not None else None
@@ -127,6 +131,8 @@ class LoginPolicy:
         plugins, files, username = self._plugins, self._files, connect.username
         if connect.password is not None and is_token(connect.password):
             return files.by_token(username, connect.password, connect.client_id), None
+        if anonymous == "always":
+            return Identity(None, connect.client_id), None
         is_known = plugins is None or not plugins.authenticates or files.knows(username)
         if is_known or username is None:
             who = await files.authenticate(

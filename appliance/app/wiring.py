@@ -40,6 +40,7 @@ def listener_settings(settings: Settings, tls: TlsContexts | None) -> list[Liste
             port=listener.bind.port,
             path=listener.bind.path,
             context=tls.source(listener_name(index)) if listener.tls and tls else None,
+            terms=listener.terms(),
         )
         for index, listener in enumerate(settings.broker.listeners)
     ]

@@ -24,8 +24,11 @@ from appliance.broker.handshake import (
     is_text,
     maximum_packet_size,
     pending_will,
+    refusal_of_connect,
+    too_large,
 )
 from appliance.broker.inflow import Inflow
+from appliance.broker.limits import USUAL_TERMS, Terms
 from appliance.broker.message import OVERHEAD, DelayedMessage, Message
 from appliance.broker.output import CANNOT_KEEP, LONGEST_REASON, Output, in_words
 from appliance.broker.ports import Exchange, Transport
@@ -102,6 +105,12 @@ Arrived: TypeAlias = "Packet | RawPublish"
 HOST_BURST = 100
 
 
+#: What the ids begin with that the broker gives.
+_ASSIGNED: Final = "auto-"
+
+_NO_TEXT: Final = "the payload is marked as UTF-8 text and is not"
+
+
 def _size(arrived: Arrived) -> int:
     """Bytes that are counted for a packet that is queued behind a waiting message."""
     if isinstance(arrived, tuple):
@@ -121,19 +130,29 @@ _EXPLAINED: Final = frozenset(
     (
         ReasonCode.BAD_AUTHENTICATION_METHOD,
         ReasonCode.PAYLOAD_FORMAT_INVALID,
+        ReasonCode.QOS_NOT_SUPPORTED,
         ReasonCode.QUOTA_EXCEEDED,
+        ReasonCode.RETAIN_NOT_SUPPORTED,
         ReasonCode.TOPIC_NAME_INVALID,
+        ReasonCode.UNSUPPORTED_PROTOCOL_VERSION,
     )
 )
 
 
 class ClientHandler:
-    """Handles the packets of one network connection; `output` encodes and sends the answers."""
+    """Handles the packets of one network connection; `output` encodes and sends the answers.
 
-    def __init__(self, broker: Broker, transport: Transport) -> None:
+    `terms` are those of its listener. They, and the sizes in the limits, hold for as long as the
+    connection: the client is told them once.
+    """
+
+    def __init__(self, broker: Broker, transport: Transport, terms: Terms = USUAL_TERMS) -> None:
         self.broker = broker
         self.transport = transport
+        self._terms = terms
         limits = broker.limits
+        self._payload_size = limits.payload_size
+        self._refused_flags = terms.refused_flags
         self.protocol = ServerProtocol(
             limits.packet_size, limits.topic_alias, limits.user_properties
         )
@@ -317,15 +336,20 @@ class ClientHandler:
         session = self.session
         assert session is not None
         counters = self._counters
+        size = len(payload)
         counters.publish_received += 1
-        counters.publish_bytes_received += len(payload)
+        counters.publish_bytes_received += size
         # A cached route has the topic decoded and checked, which saves this for each message.
         if session.epoch == router.epoch and topic_wire in session.routes:
             route: Fanout = session.routes[topic_wire]
         else:
             route = router.route(session, topic_wire)
-            if route.undecided and self._hold(route, len(payload), self._on_raw_publish, event):
+            if route.undecided and self._hold(route, size, self._on_raw_publish, event):
                 return
+        if size > self._payload_size and route.allowed:
+            counters.cost += PACKET_COST
+            self._refuse_size(session, route.topic, first >> 1 & 3, packet_id, payload)
+            return
         targets = route.targets
         if first == 0x30 and route.allowed and self.broker.observer is None:
             counters.cost += 1 + len(targets)
@@ -336,10 +360,13 @@ class ClientHandler:
                 for target in targets
                 if target[3]
                 or target[0].link is None
-                or not target[0].link.mirror(head, self._version, len(payload))
+                or not target[0].link.mirror(head, self._version, size)
             ]
             if not targets and route.is_plain:
                 return
+        # Not before: what goes the way above has no such flag.
+        if first & self._refused_flags:
+            raise self._unsupported(first)
         qos = first >> 1 & 3
         message = Message(route.topic, payload, qos, first & 1 == 1, None, None, topic_wire)
         if first & 8 or (self._arrived_at and self._is_old()):
@@ -370,6 +397,9 @@ class ClientHandler:
         counters = self._counters
         counters.publish_received += 1
         counters.publish_bytes_received += len(packet.payload)
+        flags = packet.qos << 1 | packet.retain
+        if flags & self._refused_flags:
+            raise self._unsupported(flags)
         message = Message(
             packet.topic,
             packet.payload,
@@ -387,12 +417,15 @@ class ClientHandler:
         packet_id = packet.packet_id or 0
         if packet.qos and self._congested and self._must_wait(packet, message, route):
             return
-        if (
+        if len(packet.payload) > self._payload_size and route.allowed:
+            self._refuse_size(session, packet.topic, packet.qos, packet_id, packet.payload)
+        elif (
             route.allowed  # checked before anything costly
             and broker.features.check_payload_format
             and not is_text(message.payload, packet.properties)
         ):
-            self._refuse_payload(session, message, packet_id)
+            code, reason = ReasonCode.PAYLOAD_FORMAT_INVALID, _NO_TEXT
+            self._refuse_payload(session, packet.topic, packet.qos, packet_id, code, reason)
         elif packet.qos == 2:
             self._on_publish_qos2(session, packet_id, message, route)
         elif self._arrived_at and route.allowed and self._accounting.has_expired(message):
@@ -619,16 +652,35 @@ class ClientHandler:
         arrived_at = self._arrived_at or self._accounting.now
         return arrived_at + interval if isinstance(interval, int) else None
 
-    def _refuse_payload(self, session: Session, message: Message, packet_id: int) -> None:
+    def _unsupported(self, flags: int) -> ProtocolError:
+        """The error of a PUBLISH with flags that the listener's terms exclude.
+
+        [MQTT-3.2.2-11] and [MQTT-3.2.2-14] forbid it to a client of MQTT 5, which was told. One of
+        3.1.1 has no other way to learn it than the end of its connection.
+        """
+        qos = flags >> 1 & 3
+        if qos > self._terms.max_qos:
+            text = f"QoS {qos}, more than its listener's max_qos of {self._terms.max_qos}"
+            return ProtocolError(ReasonCode.QOS_NOT_SUPPORTED, text)
+        text = "a message to be retained, which its listener does not take (retain: false)"
+        return ProtocolError(ReasonCode.RETAIN_NOT_SUPPORTED, text)
+
+    def _refuse_size(
+        self, session: Session, topic: str, qos: int, packet_id: int, payload: bytes
+    ) -> None:
+        reason = too_large(payload, self._payload_size)
+        self._refuse_payload(session, topic, qos, packet_id, ReasonCode.QUOTA_EXCEEDED, reason)
+
+    def _refuse_payload(
+        self, session: Session, topic: str, qos: int, packet_id: int, code: ReasonCode, reason: str
+    ) -> None:
+        """Refuse a message that the rules allow; with QoS 0, and in 3.1.1, it is lost silently."""
         self._counters.publish_refused += 1
-        reason = "the payload is marked as UTF-8 text and is not"
-        self.broker.log_rate_limited(
-            session, "may not publish to %s: %s", quote(message.topic), reason
-        )
-        if message.qos == 1:
-            self.output.acknowledge(0x40, packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
-        elif message.qos:
-            self._refuse_qos2(packet_id, ReasonCode.PAYLOAD_FORMAT_INVALID, reason)
+        self.broker.log_rate_limited(session, "may not publish to %s: %s", quote(topic), reason)
+        if qos == 1:
+            self.output.acknowledge(0x40, packet_id, code, reason)
+        elif qos:
+            self._refuse_qos2(packet_id, code, reason)
 
     def _on_publish_qos2(
         self, session: Session, packet_id: int, message: Message, route: Fanout
@@ -774,6 +826,7 @@ class ClientHandler:
                     session,
                     packet,
                     self._wake,
+                    max_qos=self._terms.max_qos,
                     explains=self.output.explains,
                     may_explain=self.output.may_explain,
                 )
@@ -858,6 +911,12 @@ class ClientHandler:
         if packet.client_id.startswith(INSIDE):
             reason = f"client ids that begin with {INSIDE} are the appliance's own"
             self.refuse(ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, reason)
+            return
+        refusal = refusal_of_connect(
+            packet, packet.client_id or _ASSIGNED, self._payload_size, self._terms
+        )
+        if refusal is not None:
+            self.refuse(*refusal)
             return
         will = packet.will
         excess = self._router.excess(will.topic) if will is not None else ""
@@ -963,7 +1022,7 @@ class ClientHandler:
             return
         self.protocol.forget_connect()
         self._count_held()
-        assigned = None if packet.client_id else "auto-" + str(uuid.uuid4()).upper()
+        assigned = None if packet.client_id else _ASSIGNED + str(uuid.uuid4()).upper()
         identity = Identity(username, assigned or packet.client_id)
         try:
             agreement = agree(packet, self.broker.limits)
@@ -1039,6 +1098,7 @@ class ClientHandler:
             identity,
             self.broker.limits,
             self.broker.features,
+            self._terms,
             authentication or {},
         )
         # In 3.1 the byte of Session Present is reserved.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from appliance.broker.delivery import PendingWill
-from appliance.broker.limits import USUAL_PACKET_SIZE, Features, Limits
+from appliance.broker.limits import USUAL_PACKET_SIZE, Features, Limits, Terms
 from appliance.broker.message import Message
 from appliance.broker.values import Identity
-from appliance.mqtt.codec import Properties, Property
+from appliance.mqtt.codec import VERSION_NAMES, Properties, Property
 from appliance.mqtt.packets import Connect
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
@@ -72,6 +72,7 @@ def connack_properties(
     identity: Identity,
     limits: Limits,
     features: Features,
+    terms: Terms,
     authentication: Properties,
 ) -> Properties | None:
     """The properties of CONNACK, in mosquitto's order: the limits that the client must observe.
@@ -97,11 +98,49 @@ def connack_properties(
         if len(information.encode()) <= LONGEST_STRING:  # a user name may be that long by itself
             properties[Property.RESPONSE_INFORMATION] = information
     properties |= authentication
+    if not terms.retain:
+        properties[Property.RETAIN_AVAILABLE] = 0
     if limits.packet_size < USUAL_PACKET_SIZE:
         properties[Property.MAXIMUM_PACKET_SIZE] = limits.packet_size
     if limits.inflight != 0xFFFF:
         properties[Property.RECEIVE_MAXIMUM] = limits.inflight
+    if terms.max_qos < 2:  # [MQTT-3.2.2-9]
+        properties[Property.MAXIMUM_QOS] = terms.max_qos
     return properties
+
+
+def refusal_of_connect(
+    connect: Connect, client_id: str, payload_size: int, terms: Terms
+) -> tuple[ReasonCode, str] | None:
+    """Why this listener does not take such a client, if so: the code for CONNACK, and in words.
+
+    `client_id` is the one that it will have, also where the broker gives it.
+    """
+    if connect.version not in terms.versions:  # [MQTT-3.1.2-2], 3.1.1 [MQTT-3.1.2-2]
+        name = VERSION_NAMES[connect.version]
+        reason = f"MQTT {name} is not spoken at its listener (protocol_versions)"
+        return ReasonCode.UNSUPPORTED_PROTOCOL_VERSION, reason
+    prefixes = terms.client_id_prefixes
+    if prefixes and not client_id.startswith(prefixes):
+        reason = "its id begins otherwise than its listener asks for (client_id_prefixes)"
+        return ReasonCode.CLIENT_IDENTIFIER_NOT_VALID, reason
+    will = connect.will
+    if will is None:
+        return None
+    if will.qos > terms.max_qos:  # [MQTT-3.2.2-12]
+        reason = f"its will has QoS {will.qos}, more than its listener's max_qos of {terms.max_qos}"
+        return ReasonCode.QOS_NOT_SUPPORTED, reason
+    if will.retain and not terms.retain:  # [MQTT-3.2.2-13]
+        reason = "its will is to be retained, which its listener does not take (retain: false)"
+        return ReasonCode.RETAIN_NOT_SUPPORTED, reason
+    if len(will.payload) > payload_size:
+        return ReasonCode.QUOTA_EXCEEDED, f"its will has {too_large(will.payload, payload_size)}"
+    return None
+
+
+def too_large(payload: bytes, limit: int) -> str:
+    """What is wrong with a payload that exceeds the limit."""
+    return f"a payload of {len(payload)} bytes, more than {limit} (broker.limits.payload_size)"
 
 
 def pending_will(connect: Connect) -> PendingWill | None:

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
 
 #: The largest packet, in bytes, that is accepted where CONNACK announces no limit.
 USUAL_PACKET_SIZE = 16 * 1024 * 1024
+
+#: No payload is larger: the largest Remaining Length of a packet (section 1.5.5).
+ANY_SIZE = 0xFFF_FFFF
+
+#: MQTT 3.1, 3.1.1 and 5, as CONNECT names them.
+VERSIONS: Final = frozenset((3, 4, 5))
+
+#: Whether clients without a user name are admitted; None: as configured for all listeners. Always:
+#: also those that give one, which nobody checks.
+Anonymous: TypeAlias = bool | Literal["always"] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +38,7 @@ class Limits:
 
     connections: int = 1000
     packet_size: int = USUAL_PACKET_SIZE
+    payload_size: int = ANY_SIZE
     memory: int = 256 * 1024 * 1024
     queue_messages: int = 1000
     queue_bytes: int = 16 * 1024 * 1024
@@ -46,6 +58,30 @@ class Limits:
     keep_alive: int = 65535
     sessions: int = 10_000
     user: UserLimits = UserLimits()
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What a listener admits, and whom; see `broker.listeners` in appliance.yaml."""
+
+    anonymous: Anonymous = None
+    max_qos: int = 2
+    retain: bool = True
+    versions: frozenset[int] = VERSIONS
+    #: What client ids begin with; with anything where there is none.
+    client_id_prefixes: tuple[str, ...] = ()
+
+    @property
+    def refused_flags(self) -> int:
+        """The bits of a PUBLISH's first byte that may not be set (section 3.3.1).
+
+        QoS 1 and 2 are one bit each, and 3 does not exist.
+        """
+        return (0x06, 0x04, 0x00)[self.max_qos] | (0 if self.retain else 0x01)
+
+
+#: Of a listener that restricts nothing.
+USUAL_TERMS: Final = Terms()
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,11 +75,13 @@ def subscribe(
     packet: Subscribe,
     wake: Callable[[], None],
     *,
+    max_qos: int = 2,
     explains: bool = False,
     may_explain: bool = False,
 ) -> Iterator[Step]:
     """Process the packet; yields its SUBACK, and None where other clients should have a turn.
 
+    No more than `max_qos` is granted, and nothing refused for asking for more [MQTT-3.2.2-10].
     If a decision is pending, `wake` is called when the work can continue. With `explains` the
     SUBACK contains the reason of the first refusal; with `may_explain` what is wrong with its
     max-rate, which is the client's own.
@@ -121,6 +123,7 @@ def subscribe(
             if turn.is_over(CHECK_COST):
                 yield None
             continue
+        subscription.qos = min(subscription.qos, max_qos)
         is_new = subscription.filter not in session.subscriptions
         code, reason = broker.subscribe(session, subscription)
         codes.append(code)

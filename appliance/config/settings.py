@@ -21,7 +21,7 @@ from pydantic import (
     model_serializer,
 )
 
-from appliance.broker.limits import Features, Limits, UserLimits
+from appliance.broker.limits import Anonymous, Features, Limits, Terms, UserLimits
 from appliance.config.quantities import (
     Address,
     Bind,
@@ -48,6 +48,7 @@ from appliance.config.values import (
     QueueFull,
     Retain,
     RosNames,
+    SpokenVersion,
     TlsVersion,
     ValueEncoding,
     Vda5050Version,
@@ -55,6 +56,7 @@ from appliance.config.values import (
     check_allow,
     check_clamp,
     check_client_id,
+    check_client_id_prefix,
     check_direction,
     check_fleet_prefix,
     check_login_name,
@@ -77,6 +79,7 @@ from appliance.config.values import (
     from_names,
     vda5050_in_full,
 )
+from appliance.mqtt.codec import VERSION_NAMES
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -125,7 +128,7 @@ class Listener(_Section):
     """One listening address, with or without TLS; `mode` is that of a Unix socket.
 
     `client_certificates`, `min_version` and `ciphers` default to those of `broker.tls`, and
-    `anonymous` to `broker.anonymous`.
+    `anonymous` to `broker.anonymous`. Without `client_id_prefixes` any id will do.
     """
 
     bind: Address
@@ -135,7 +138,20 @@ class Listener(_Section):
     min_version: TlsVersion | None = None
     ciphers: str | None = None
     mode: Mode = 0o660
-    anonymous: bool | None = None
+    anonymous: bool | Literal["always"] | None = None
+    max_qos: Annotated[int, Field(ge=0, le=2)] = 2
+    retain: bool = True
+    protocol_versions: Annotated[list[SpokenVersion], Field(min_length=1)] = ["3.1", "3.1.1", "5"]
+    client_id_prefixes: list[Annotated[str, AfterValidator(check_client_id_prefix)]] = []
+
+    def terms(self) -> Terms:
+        """What it admits, and whom, as the broker enforces it."""
+        numbers = {name: number for number, name in VERSION_NAMES.items()}
+        return self.build(
+            Terms,
+            versions=frozenset(numbers[name] for name in self.protocol_versions),
+            client_id_prefixes=tuple(self.client_id_prefixes),
+        )
 
     @property
     def is_mqtts(self) -> bool:
@@ -154,6 +170,13 @@ class Listener(_Section):
         if tls and bind is not None and bind.path is not None:
             raise ValueError("must be false for a Unix socket: nobody can listen in on it")
         return tls
+
+    @field_validator("anonymous")
+    @classmethod
+    def _check_anonymous(cls, anonymous: Anonymous, info: ValidationInfo) -> Anonymous:
+        if anonymous == "always" and info.data.get("protocol") == "web":
+            raise ValueError("must not be always for the web, where people log in")
+        return anonymous
 
 
 class TlsSection(_Section):
@@ -195,6 +218,7 @@ class LimitsSection(_Section):
     connection_rate: Count = 100
     failed_logins: Count = 30
     packet_size: Annotated[Size, Field(ge=128, le=PACKET_SIZE_MAX)] = _LIMITS.packet_size
+    payload_size: Annotated[Size, Field(ge=1)] | None = None
     memory: Annotated[Size, Field(ge=1 << 10)] = _LIMITS.memory
     queue_messages: Count = _LIMITS.queue_messages
     queue_bytes: Annotated[Size, Field(ge=1)] = _LIMITS.queue_bytes
@@ -220,6 +244,7 @@ class LimitsSection(_Section):
         """The limits that the broker enforces; listeners and the login throttle have the others."""
         return self.build(
             Limits,
+            payload_size=self.payload_size or _LIMITS.payload_size,
             keep=0 if self.keep == "latest" else self.keep,
             session_expiry=round(self.session_expiry),
             keep_alive=round(self.keep_alive),
@@ -285,7 +310,7 @@ class BrokerSection(_Section):
 
     def lets_in_anonymous(self, listener: Listener) -> bool:
         """Whether that listener accepts clients without a user name."""
-        return self.anonymous if listener.anonymous is None else listener.anonymous
+        return bool(self.anonymous if listener.anonymous is None else listener.anonymous)
 
     def client_certificates(self, listener: Listener) -> Literal["off", "optional", "required"]:
         """Whether that listener requests or requires client certificates."""

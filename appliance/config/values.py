@@ -75,6 +75,13 @@ def check_client_id(value: str) -> str:
     return value
 
 
+def check_client_id_prefix(value: str) -> str:
+    """The beginning of client ids; an empty one would admit every id."""
+    if not value:
+        raise ValueError("must not be empty: without any prefix every client id will do")
+    return value
+
+
 def check_login_name(value: str) -> str:
     _check_robot_only(value)
     return value
@@ -364,6 +371,13 @@ ClientCertificates = Annotated[
 
 
 ProtocolVersion = Annotated[Literal["5", "3.1.1"], BeforeValidator(_unquoted_protocol)]
+
+
+SpokenVersion = Annotated[
+    Literal["3.1", "3.1.1", "5"],
+    BeforeValidator(_unquoted_version),
+    BeforeValidator(_unquoted_protocol),
+]
 
 
 Vda5050Version = Annotated[

@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from appliance.access import AccessFileError, Acl, check_hash, check_username
+from appliance.access import AccessFileError, check_hash, check_username
 from appliance.access.problems import read_text
+from appliance.broker.limits import Anonymous
+from appliance.importing import rules
 from appliance.importing.model import Configuration, Listener
-from appliance.importing.notes import ImportProblemsError, Notes, Place
+from appliance.importing.notes import Notes, Place
 from appliance.importing.reading import Statement, locate
 
 _EVERYTHING = """\
 # mosquitto.conf names no acl_file: whoever is let in may read and write every topic.
+topic readwrite #
+topic read $SYS/#
 pattern readwrite #
 pattern read $SYS/#
 """
@@ -43,7 +47,7 @@ class Access:
     names: tuple[str, ...]
     acl: str
     anonymous: bool
-    by_listener: dict[int, bool]
+    by_listener: dict[int, Anonymous]
 
 
 def convert(
@@ -64,33 +68,46 @@ class _Converter:
         self._plugin = configuration.plugin()
 
     def convert(self) -> Access:
-        anonymous = {index: self._is_anonymous(each) for index, each in enumerate(self._listeners)}
+        anonymous = {
+            index: self._configuration.is_anonymous(each)
+            for index, each in enumerate(self._listeners)
+        }
         passwords = self._one_of("password_file")
-        rules = self._one_of("acl_file")
+        acl_file = self._one_of("acl_file")
         users, names = self._users(passwords)
-        acl = self._acl(rules, anonymous)
+        acl = self._acl(acl_file, anonymous)
         if not names and not all(anonymous.values()):
             self._tell_of_nobody()
-        securities = [self._configuration.security(each) for each in self._listeners]
-        if any(
-            anonymous[index] and each.get("password_file") is None
-            for index, each in enumerate(securities)
-        ):
-            self._tell_of_strangers()
+        for index, listener in enumerate(self._listeners):
+            if anonymous[index] and not self._takes_any_name(listener):
+                self._tell_of_strangers(listener)
         overall = self._configuration.general.flag(
             "allow_anonymous", self._configuration.local_only
         )
         if self._configuration.per_listener:
             overall = False
-        differing = {index: each for index, each in anonymous.items() if each != overall}
+        differing: dict[int, Anonymous] = {
+            index: each for index, each in anonymous.items() if each != overall
+        }
+        differing |= {
+            index: "always"
+            for index, each in enumerate(self._listeners)
+            if anonymous[index] and self._takes_any_name(each)
+        }
         return Access(users, tuple(names), acl, overall, differing)
 
-    def _is_anonymous(self, listener: Listener) -> bool:
-        own = listener.get("listener_allow_anonymous")
-        if own is not None:
-            return own.flag
+    def _takes_any_name(self, listener: Listener) -> bool:
+        """Whether clients of that listener, where anonymous ones come in, may give any user name.
+
+        With rules the name decides in mosquitto what they may do, though nobody has checked it.
+        """
         security = self._configuration.security(listener)
-        return security.flag("allow_anonymous", self._configuration.local_only)
+        return (
+            self._plugin is None
+            and security.get("password_file") is None
+            and security.get("acl_file") is None
+            and not listener.names_by_certificate
+        )
 
     def _one_of(self, option: str) -> Statement | None:
         """The file that counts; listeners that name another one are not among these."""
@@ -135,36 +152,13 @@ class _Converter:
             text = "whoever is let in may write every topic, those that command ROS too"
             self._notes.add(Place(self._configuration.name, 0), "no acl_file", text)
             return _EVERYTHING
-        path = locate(statement.value, self._directory)
-        rules = self._text(statement)
-        if path is None or rules is None:
+        found = self._text(statement)
+        if found is None:
             return _NOTHING
-        try:
-            Acl.load(path, "robot")
-        except AccessFileError as error:
-            raise ImportProblemsError(
-                [(Place(path.name, each.line), each.message) for each in error.problems]
-            ) from None
-        rules = rules if rules.endswith("\n") else f"{rules}\n"
-        rules = self._without_control(rules, path.name)
-        return self._with_anonymous(rules, statement, anonymous)
+        carried = rules.carry_over(found, Path(statement.value).name, self._notes)
+        return self._with_anonymous(carried, statement, anonymous)
 
-    def _without_control(self, text: str, name: str) -> str:
-        """The rules without those on $CONTROL, which were about mosquitto's plugins.
-
-        Here they would give the right to manage the appliance.
-        """
-        kept: list[str] = []
-        for number, line in enumerate(text.splitlines(keepends=True), 1):
-            words = line.split()
-            if words[:1] in (["topic"], ["pattern"]) and words[-1].upper().startswith("$CONTROL"):
-                why = "is left out: on $CONTROL the appliance is managed, docs/management.md"
-                self._notes.add(Place(name, number), line.strip(), why)
-                line = f"# {line}"
-            kept.append(line)
-        return "".join(kept)
-
-    def _with_anonymous(self, text: str, rules: Statement, anonymous: dict[int, bool]) -> str:
+    def _with_anonymous(self, text: str, acl_file: Statement, anonymous: dict[int, bool]) -> str:
         """The rules, of which those for anonymous clients are of the listeners that have some."""
         if not self._configuration.per_listener:
             return text
@@ -174,7 +168,9 @@ class _Converter:
             named = listener.get("acl_file")
             if not anonymous[index]:
                 if named is None and listener.get("password_file") is not None:
-                    why = f"{listener} has no acl_file; its users have the rules of {rules.place}"
+                    why = (
+                        f"{listener} has no acl_file; its users have the rules of {acl_file.place}"
+                    )
                     self._notes.add(listener.place, "acl_file", why)
                 continue
             if named is None:
@@ -187,7 +183,7 @@ class _Converter:
             for index in free:
                 self._refuse(index, anonymous, "has no acl_file, and other listeners have")
             return text
-        return _ANONYMOUS + _without_anonymous(text)
+        return _ANONYMOUS + rules.without_anonymous(text)
 
     def _refuse(self, index: int, anonymous: dict[int, bool], why: str) -> None:
         listener = self._listeners[index]
@@ -213,35 +209,20 @@ class _Converter:
         return None
 
     def _tell_of_nobody(self) -> None:
-        by_certificate = any(each.flag("use_identity_as_username") for each in self._listeners)
+        by_certificate = any(each.names_by_certificate for each in self._listeners)
         if not by_certificate and self._listeners:
             text = "nobody can log in yet: appliance user add NAME"
             self._notes.add(Place("users.passwd", 0), "no user", text, to_do=True)
 
-    def _tell_of_strangers(self) -> None:
+    def _tell_of_strangers(self, listener: Listener) -> None:
+        security = self._configuration.security(listener)
+        if security.get("password_file") is not None or self._plugin is not None:
+            return
         text = (
-            "who gives a user name is checked here: mosquitto lets every name in where it has no "
-            "password_file; such clients have to leave the name out, or become users"
+            "who gives a user name is checked here: mosquitto believes any name where it has no "
+            "password_file, and applies that user's rules; such clients have to leave the name "
+            "out, or become users"
         )
-        blocks = (self._configuration.general, *self._listeners)
-        found = (each.get("allow_anonymous", "listener_allow_anonymous") for each in blocks)
-        place = next((each.place for each in found if each), Place(self._configuration.name, 0))
+        found = listener.get("listener_allow_anonymous") or security.get("allow_anonymous")
+        place = found.place if found else Place(self._configuration.name, 0)
         self._notes.add(place, "allow_anonymous", text)
-
-
-def _without_anonymous(text: str) -> str:
-    """The rules without `topic` lines before the first user, which have applied to nobody."""
-    kept: list[str] = []
-    is_before = True
-    for line in text.splitlines(keepends=True):
-        words = line.split()
-        is_before = is_before and words[:1] != ["user"]
-        if not (is_before and words[:1] == ["topic"]):
-            kept.append(line)
-    return "".join(kept)
-
-
-def named_in(acl: str) -> set[str]:
-    """The users that the rules name."""
-    lines = (line.split(None, 1) for line in acl.splitlines())
-    return {words[1].strip() for words in lines if len(words) == 2 and words[0] == "user"}

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from appliance.importing import access, bridges, limits, listeners
+from appliance.importing import access, bridges, limits, listeners, rules
 from appliance.importing.model import Block, Configuration, assemble
 from appliance.importing.notes import ImportProblemsError, Note, Notes, Place
 from appliance.importing.options import option_of
@@ -68,11 +68,11 @@ def import_mosquitto(path: Path, robot: str) -> Imported:
             [(place, "no listener can be carried over"), *((n.place, n.text) for n in notes.found)]
         )
     who = access.convert(configuration, kept, directory, notes)
-    users = {*who.names, *access.named_in(who.acl)}
+    users = {*who.names, *rules.named_in(who.acl)}
     links = bridges.convert(configuration.bridges, robot, directory, notes, users)
     broker: dict[str, Any] = {
         "listeners": [
-            listeners.section(listener, who.by_listener.get(index), notes)
+            listeners.section(listener, who.by_listener.get(index), configuration.general, notes)
             for index, listener in enumerate(kept)
         ],
         **({"anonymous": True} if who.anonymous else {}),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from appliance.broker.limits import USUAL_PACKET_SIZE
 from appliance.config import format_duration, format_size
 from appliance.config.settings import PACKET_SIZE_MAX
 from appliance.importing.model import Configuration
@@ -60,15 +61,14 @@ def _limit(statement: Statement, found: dict[str, Any], notes: Notes) -> None:
         if size != statement.number:
             notes.add(place, name, f"the nearest that can be set is {format_size(size)}")
     elif name == "message_size_limit" and statement.number > 0:
-        size = min(statement.number + _PACKET_OVERHEAD, PACKET_SIZE_MAX)
-        found.setdefault("packet_size", format_size(size))
-        text = (
-            "a payload has no limit of its own: packet_size has this and room for topic and "
-            "properties; a client that sends more is disconnected, and not only the message lost"
-        )
-        notes.add(place, name, text)
+        found["payload_size"] = format_size(statement.number)
+        if statement.number + _PACKET_OVERHEAD > USUAL_PACKET_SIZE:
+            size = min(statement.number + _PACKET_OVERHEAD, PACKET_SIZE_MAX)
+            found.setdefault("packet_size", format_size(size))
     elif name == "max_keepalive" and 0 < statement.number < _KEEP_ALIVE_MAX:
         found["keep_alive"] = format_duration(statement.number)
+        text = "clients of MQTT 3 are refused if they ask for more, as they cannot be told"
+        notes.add(place, name, text)
     elif name == "memory_limit" and statement.number >= _MEMORY_MIN:
         found["memory"] = format_size(statement.number)
         text = "limits.memory is what waits for clients, and not the whole process"

@@ -5,15 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from appliance.broker.limits import Anonymous
 from appliance.importing.model import Block, Configuration, Listener
-from appliance.importing.notes import Notes
+from appliance.importing.notes import ImportProblemsError, Notes
 from appliance.importing.options import OPTIONS
 from appliance.importing.reading import Statement, locate
 
 _TLS_FILES = {"certfile": "certificate", "keyfile": "key", "cafile": "ca", "crlfile": "crl"}
 _VERSIONS = {"tlsv1.2": "1.2", "tlsv1.3": "1.3"}
 #: A listener with one of these would let in, or mix up, whom mosquitto keeps apart.
-_LEFT_OUT = ("psk_hint", "mount_point", "enable_proxy_protocol")
+_LEFT_OUT = (
+    "psk_hint",
+    "mount_point",
+    "enable_proxy_protocol",
+    "use_subject_as_username",
+    "use_username_as_clientid",
+)
 
 
 def carried(configuration: Configuration, notes: Notes) -> list[Listener]:
@@ -21,7 +28,7 @@ def carried(configuration: Configuration, notes: Notes) -> list[Listener]:
     kept = []
     for listener in configuration.listeners:
         protocol = listener.get("protocol")
-        reasons = listener.named(*_LEFT_OUT)
+        reasons = [each for each in listener.named(*_LEFT_OUT) if not _is_off(each)]
         if protocol is not None and protocol.value == "http_api":
             text = f"{listener} is left out: the appliance's HTTP is `protocol: web`, docs/http.md"
             notes.add(protocol.place, "protocol", text)
@@ -31,9 +38,15 @@ def carried(configuration: Configuration, notes: Notes) -> list[Listener]:
         elif listener.get("keyfile") is None and listener.get("certfile") is not None:
             text = f"{listener} has a certfile and no keyfile: it is left out"
             notes.add(listener.place, "certfile", text, to_do=True)
-        elif not reasons:  # these are noted as all options without a counterpart
+        elif not reasons and not _is_closed(
+            listener, configuration, notes
+        ):  # these are noted as all options without a counterpart
             kept.append(listener)
     return [each for each in kept if not _is_apart(each, kept, configuration, notes)]
+
+
+def _is_off(statement: Statement) -> bool:
+    return OPTIONS[statement.name].kind == "flag" and not statement.flag
 
 
 #: What says whom a certificate lets in, and the files of users and rules: one for all listeners.
@@ -42,7 +55,6 @@ _BY_CERTIFICATE = (
     "capath",
     "crlfile",
     "use_identity_as_username",
-    "use_subject_as_username",
 )
 _BY_FILES = ("password_file", "acl_file")
 
@@ -66,6 +78,27 @@ def _is_apart(
             _leave_out(listener, first, option, notes)
             return True
     return False
+
+
+def _is_closed(listener: Listener, configuration: Configuration, notes: Notes) -> bool:
+    """Whether mosquitto lets nobody in there, and here users of other listeners would come in."""
+    if listener.names_by_certificate:
+        if listener.flag("require_certificate"):
+            return False
+        why = "it takes the user from a certificate, and asks for none (require_certificate)"
+    elif (
+        not configuration.per_listener
+        or configuration.plugin() is not None
+        or listener.get("password_file") is not None
+        or configuration.is_anonymous(listener)
+        or all(each.get("password_file") is None for each in configuration.listeners)
+    ):
+        return False
+    else:
+        why = "it has no users, and lets in nobody without a name"
+    text = f"{listener} is left out: {why}, so that mosquitto lets in nobody there"
+    notes.add(listener.place, str(listener), text)
+    return True
 
 
 def _value(listener: Listener, option: str) -> str | bool | None:
@@ -92,7 +125,13 @@ def _leave_out(listener: Listener, first: Listener, option: str, notes: Notes) -
     )
 
 
-def section(listener: Listener, anonymous: bool | None, notes: Notes) -> dict[str, Any]:
+#: The versions of MQTT, by the numbers that `accept_protocol_versions` has for them.
+_PROTOCOLS = {"3": "3.1", "4": "3.1.1", "5": "5"}
+
+
+def section(
+    listener: Listener, anonymous: Anonymous, general: Block, notes: Notes
+) -> dict[str, Any]:
     """One entry of `broker.listeners`."""
     found: dict[str, Any] = {"bind": _bind(listener)}
     if listener.is_tls:
@@ -116,9 +155,33 @@ def section(listener: Listener, anonymous: bool | None, notes: Notes) -> dict[st
         notes.add(protocol.place if protocol else listener.place, "protocol websockets", text)
     if anonymous is not None:
         found["anonymous"] = anonymous
+    found |= _terms(listener, general)
     if listener.path:
         text = "who may open the socket is said by its `mode`: 0660 lets its user and group"
         notes.add(listener.place, str(listener), text)
+    return found
+
+
+def _terms(listener: Listener, general: Block) -> dict[str, Any]:
+    """What it admits; of `general` what mosquitto has for all listeners."""
+    found: dict[str, Any] = {}
+    max_qos = listener.get("max_qos", "maximum_qos")
+    if max_qos is not None and max_qos.number < 2:
+        found["max_qos"] = max_qos.number
+    if not general.flag("retain_available", True):
+        found["retain"] = False
+    prefix = general.get("clientid_prefixes")
+    if prefix is not None:
+        found["client_id_prefixes"] = [prefix.value]
+    versions = listener.get("accept_protocol_versions")
+    if versions is not None:
+        numbers = [each.strip() for each in versions.value.split(",")]
+        wrong = next((each for each in numbers if each not in _PROTOCOLS), None)
+        if wrong is not None:
+            text = f"accept_protocol_versions has 3, 4 and 5, with commas, not {wrong[:20]!r}"
+            raise ImportProblemsError([(versions.place, text)])
+        if set(numbers) != set(_PROTOCOLS):
+            found["protocol_versions"] = [_PROTOCOLS[each] for each in sorted(set(numbers))]
     return found
 
 
@@ -181,16 +244,17 @@ def _add_file(
 
 
 def _username(secure: list[Listener], notes: Notes) -> dict[str, Any]:
-    required = [each for each in secure if each.flag("require_certificate")]
-    for listener in secure:
-        if listener not in required:
-            statement = listener.get("use_identity_as_username")
-            if statement is not None and statement.flag:
-                text = "counts only with require_certificate, which this listener has not"
-                notes.add(statement.place, statement.name, text)
-    # All of them say the same, see `carried`.
-    by_identity = any(each.flag("use_identity_as_username") for each in required)
-    return {"username_from": "subject"} if by_identity else {}
+    by_certificate = [each for each in secure if each.names_by_certificate]
+    for listener in by_certificate:
+        statement = listener.get("use_identity_as_username")
+        assert statement is not None
+        text = (
+            "who gives another user name than its certificate's is refused: mosquitto takes no "
+            "notice of it"
+        )
+        notes.add(statement.place, statement.name, text)
+    # All that require certificates say the same, and the others do not say so, see `carried`.
+    return {"username_from": "subject"} if by_certificate else {}
 
 
 def without_counterpart(block: Block, notes: Notes) -> None:

@@ -50,6 +50,11 @@ class Listener(Block):
         return self.get("certfile") is not None and self.get("keyfile") is not None
 
     @property
+    def names_by_certificate(self) -> bool:
+        """Whether the common name of a certificate is the user; without TLS it never is."""
+        return self.is_tls and self.flag("use_identity_as_username")
+
+    @property
     def is_websocket(self) -> bool:
         """Whether it takes MQTT over WebSocket."""
         protocol = self.get("protocol")
@@ -81,6 +86,13 @@ class Configuration:
     def security(self, listener: Listener) -> Block:
         """Where the options of access of that listener are."""
         return listener if self.per_listener else self.general
+
+    def is_anonymous(self, listener: Listener) -> bool:
+        """Whether that listener lets in clients without a user name."""
+        own = listener.get("listener_allow_anonymous")
+        if own is not None:
+            return own.flag
+        return self.security(listener).flag("allow_anonymous", self.local_only)
 
     def plugin(self) -> Statement | None:
         """A plugin, if there is one."""

@@ -82,9 +82,7 @@ _GENERAL: Final = {
         "appliance store prune",
         _OFF,
     ),
-    "clientid_prefixes": _none(
-        "general", "text", "client ids are not restricted: let clients log in as users instead"
-    ),
+    "clientid_prefixes": _carried("general", "text", "client_id_prefixes of each listener"),
     "connection_messages": _none(
         "general", "flag", "connections are always logged at level info", _ON
     ),
@@ -117,7 +115,7 @@ _GENERAL: Final = {
     "max_queued_bytes": _carried("general", "number", "broker.limits.queue_bytes"),
     "max_queued_messages": _carried("general", "number", "broker.limits.queue_messages"),
     "memory_limit": _carried("general", "number", "broker.limits.memory"),
-    "message_size_limit": _carried("general", "number", "broker.limits.packet_size"),
+    "message_size_limit": _carried("general", "number", "broker.limits.payload_size"),
     "packet_buffer_size": _already("general", "number", "buffers grow as needed"),
     "password_file": _carried("security", "text", "users.passwd"),
     "per_listener_settings": _carried("general", "flag", "anonymous of each listener"),
@@ -143,7 +141,7 @@ _GENERAL: Final = {
     "queue_qos0_messages": _none(
         "general", "flag", "of QoS 0 nothing waits for an absent client: use QoS 1", _OFF
     ),
-    "retain_available": _none("general", "flag", "retained messages cannot be turned off", _ON),
+    "retain_available": _carried("general", "flag", "retain of each listener"),
     "retain_expiry_interval": _none(
         "general",
         "number",
@@ -161,9 +159,7 @@ _GENERAL: Final = {
 }
 
 _LISTENER: Final = {
-    "accept_protocol_versions": _none(
-        "listener", "text", "MQTT 3.1, 3.1.1 and 5 are all taken", ("3,4,5", "3, 4, 5")
-    ),
+    "accept_protocol_versions": _carried("listener", "text", "protocol_versions of the listener"),
     "bind_address": _carried("listener", "text", "broker.listeners"),
     "bind_interface": _none(
         "listener",
@@ -202,12 +198,8 @@ _LISTENER: Final = {
         "listener", "text", "ids that the broker gives cannot be named"
     ),
     "max_connections": _carried("listener", "number", "broker.limits.connections"),
-    "max_qos": _none(
-        "listener", "number", "clients may use every QoS, up to 2; 1 and 2 are stored", ("2",)
-    ),
-    "maximum_qos": _none(
-        "listener", "number", "clients may use every QoS, up to 2; 1 and 2 are stored", ("2",)
-    ),
+    "max_qos": _carried("listener", "number", "max_qos of the listener", "0", "1", "2"),
+    "maximum_qos": _carried("listener", "number", "max_qos of the listener", "0", "1", "2"),
     "max_topic_alias": _carried("listener", "number", "broker.limits.topic_alias"),
     "max_topic_alias_broker": _none("listener", "number", "the broker uses no aliases", ("0",)),
     "mount_point": _none(
@@ -236,16 +228,17 @@ _LISTENER: Final = {
     "use_subject_as_username": _none(
         "listener",
         "flag",
-        "a certificate names its user by the common name (broker.tls.username_from: subject) and "
-        "not by the whole subject; clients have to log in until you choose that, with ACL lines "
-        "that have the common name",
+        "the listener is left out: a certificate names its user by the common name "
+        "(broker.tls.username_from: subject) and not by the whole subject; add the listener with "
+        "that, and ACL lines that have the common name",
         _OFF,
     ),
     "use_username_as_clientid": _none(
         "listener",
         "flag",
-        "client ids stay as they are; a session belongs to the user that began it, so that no "
-        "other user can take it over",
+        "the listener is left out: here a client keeps its id, and rules with %c would be for any "
+        "that it chooses; a session belongs to its user anyway, so add the listener where no rule "
+        "has %c",
         _OFF,
     ),
     "websockets_origin": _none(

@@ -22,6 +22,7 @@ from typing import cast
 from appliance.broker.accounts import Account
 from appliance.broker.client import ClientHandler
 from appliance.broker.inflow import PAUSE_BEHIND
+from appliance.broker.limits import USUAL_TERMS, Terms
 from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Identity, Refusal, TlsInfo
@@ -92,14 +93,14 @@ class ClientConnection:
         scheduler: Scheduler,
         address: str,
         host: str,
-        anonymous: bool | None = None,
+        terms: Terms = USUAL_TERMS,
         outer_tls: ssl.SSLObject | None = None,
     ) -> None:
         """`outer_tls` is the TLS of a connection that this one is carried by."""
         self.address = address
         self._outer_tls = outer_tls
-        #: Whether its listener admits clients without a name; None: as configured for all.
-        self.anonymous = anonymous
+        #: Those of its listener.
+        self.terms = terms
         #: The host part of `address`; empty for a Unix socket.
         self.host = host
         #: The account that is charged for what is buffered here; that of strangers until the login.
@@ -113,7 +114,7 @@ class ClientConnection:
         self._transport: asyncio.Transport | None = None
         self._entries = scheduler.entries
         self._loop = scheduler.entries.loop
-        self._client = ClientHandler(self._broker, self)
+        self._client = ClientHandler(self._broker, self, terms)
         self._closing = False
         self._is_lost = False
         # Input: what was received and waits, and the reasons why it waits.
@@ -752,7 +753,7 @@ class ClientConnection:
     async def _log_in(self, connect: Connect) -> None:
         try:
             self._login_result = await self._scheduler.authenticate(
-                connect, self.address, self._tls, self.anonymous
+                connect, self.address, self._tls, self.terms.anonymous
             )
             self._logging_in = False
             if self._scheduler.is_busy():  # crowds reconnect at once when a network is back

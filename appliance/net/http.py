@@ -26,6 +26,7 @@ from typing import Final, Protocol, cast
 
 import h11
 
+from appliance.broker.limits import Terms
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.layers import LayerScheduler, MiddleLayer
 from appliance.net.websocket import HEAD_COST, HEAD_LIMIT, PATH, WebSocket, WebSocketHandler
@@ -89,8 +90,8 @@ class Exchange(Protocol):
 class HttpRequest:
     """A request: `path` as it was sent, without the query; names of `headers` in lower case.
 
-    `address` is the client's with its port, `peer` without (empty for a Unix socket), and
-    `anonymous` is whether its listener admits clients without a user name, None for as configured.
+    `address` is the client's with its port, `peer` without (empty for a Unix socket), and `terms`
+    are those of its listener.
     """
 
     method: str
@@ -103,7 +104,7 @@ class HttpRequest:
     address: str
     peer: str
     tls: ssl.SSLObject | None
-    anonymous: bool | None
+    terms: Terms
 
     #: The length of its body in bytes, as stated, and the exchange that it comes by.
     length: int = 0
@@ -161,7 +162,7 @@ class HttpHandler(WebSocketHandler, Protocol):
 
     address: str
     host: str
-    anonymous: bool | None
+    terms: Terms
 
     def suspend_login_limit(self) -> None:
         """The layer below limits the time."""
@@ -384,7 +385,7 @@ class HttpLayer(MiddleLayer):
             protocol.address,
             protocol.host,
             cast("ssl.SSLObject | None", self._transport.get_extra_info("ssl_object")),
-            protocol.anonymous,
+            protocol.terms,
             # h11 has checked that it is one number; it means nothing beside a coding.
             0 if is_coded else int(next((v for k, v in headers if k == "content-length"), "0")),
             self,

@@ -9,13 +9,14 @@ import math
 import socket
 import ssl
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
+from appliance.broker.limits import USUAL_TERMS, VERSIONS, Terms
 from appliance.host.addresses import network_prefix
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.connection import ClientConnection
@@ -89,8 +90,7 @@ class ListenerSettings:
     """Where a listener listens: an address, or with `path` a Unix socket of that mode.
 
     `context` is called at each connection for its TLS settings, so that these can be replaced; None
-    means no TLS. `anonymous` is whether it admits clients without a user name; None means as
-    configured for all listeners.
+    means no TLS.
     """
 
     host: str
@@ -99,7 +99,7 @@ class ListenerSettings:
     protocol: Literal["mqtt", "websocket", "web"] = "mqtt"
     path: Path | None = None
     mode: int = 0o660
-    anonymous: bool | None = None
+    terms: Terms = USUAL_TERMS
 
     @property
     def place(self) -> tuple[str, int, Path | None]:
@@ -232,7 +232,7 @@ class Listeners:
         if self._refuse(address, host):
             connection.close()
             return
-        protocol = ClientConnection(self.scheduler, address, host, listener.anonymous)
+        protocol = ClientConnection(self.scheduler, address, host, listener.terms)
         self.scheduler.connections.add(protocol)
         self._addresses.add_guest(protocol)
         context = None
@@ -256,19 +256,21 @@ class Listeners:
         return refusal
 
     def carry(
-        self, address: str, host: str, tls: ssl.SSLObject | None, anonymous: bool | None
+        self, address: str, host: str, tls: ssl.SSLObject | None, terms: Terms
     ) -> socket.socket | None:
         """The client's end of a new connection within this process; None if the limits refuse it.
 
         Who asks from there over another protocol is a client of MQTT by it: with all limits, and
-        the identity that its own connection's `tls` gives.
+        the identity that its own connection's `tls` gives. The version and the client id are not
+        the sender's, and no listener is asked about them.
         """
         if self._refuse(address, host):
             return None
         ours, theirs = socket.socketpair()
         for end in (ours, theirs):
             end.setblocking(False)
-        protocol = ClientConnection(self.scheduler, address, host, anonymous, tls)
+        terms = replace(terms, versions=VERSIONS, client_id_prefixes=())
+        protocol = ClientConnection(self.scheduler, address, host, terms, tls)
         self.scheduler.connections.add(protocol)
         self._addresses.add_guest(protocol)
         self.scheduler.in_background(self._begin(protocol, ours, None, None))

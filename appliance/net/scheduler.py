@@ -19,6 +19,7 @@ from typing import Protocol, TypeAlias
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Anonymous
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Identity, Refusal
 from appliance.host.clock import SpareClock
@@ -54,9 +55,9 @@ AFTER_FAULT = 0.1
 LINGERING_CLOSES = 256
 
 #: Finds out who sent a CONNECT: its address, its TLS connection if it has one, and whether its
-#: listener admits clients without a user name (None: as configured for all).
+#: listener admits clients without a user name.
 Authenticate: TypeAlias = Callable[
-    [Connect, str, "ssl.SSLObject | None", "bool | None"], Awaitable["Identity | Refusal"]
+    [Connect, str, "ssl.SSLObject | None", Anonymous], Awaitable["Identity | Refusal"]
 ]
 
 #: Begins an enhanced authentication by this method; None when it is not offered. There is no

@@ -16,6 +16,7 @@ from typing import Any, Final, TypeAlias
 
 import orjson
 
+from appliance.broker.limits import Terms
 from appliance.mqtt.codec import Properties, Property, reason_name
 from appliance.mqtt.packets import Publish
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -77,9 +78,7 @@ _CALL_STATUS: Final = {
 }
 
 #: The client's end of a new connection: `Listeners.carry`.
-Carry: TypeAlias = Callable[
-    [str, str, "ssl.SSLObject | None", "bool | None"], "socket.socket | None"
-]
+Carry: TypeAlias = Callable[[str, str, "ssl.SSLObject | None", Terms], "socket.socket | None"]
 
 #: The work of a JSON text by its values, or any number above the most that it may be: a number is
 #: 1, some 0.1 µs, a text, a list or an object is 8.
@@ -172,7 +171,7 @@ class Api:
             return _error(401, "login", str(error))
         if username is None and password is not None and not self._is_token(password):
             return _error(401, "login", "this is no token")  # and nobody either, if that is enough
-        end = self._carry(request.address, request.peer, request.tls, request.anonymous)
+        end = self._carry(request.address, request.peer, request.tls, request.terms)
         if end is None:
             return _error(503, "busy", "the limits allow no more connections now")
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Coroutine
 from typing import Protocol
 
 from appliance.broker.broker import Broker
+from appliance.broker.limits import Anonymous
 from appliance.broker.values import WRONG_LOGIN, Action, Decision, Identity, Refusal, TlsInfo
 from appliance.mqtt.codec import quote
 from appliance.net import tls
@@ -31,7 +32,7 @@ class Login(Protocol):
         password: bytes | None,
         address: str,
         tls: ssl.SSLObject | None = None,
-        anonymous: bool | None = None,
+        anonymous: Anonymous = None,
     ) -> Coroutine[object, object, Identity | Refusal]:
         """Who it is, or why it is refused."""
 
@@ -55,7 +56,7 @@ class WebLogin:
         except ValueError as error:
             return text(401, str(error))
         who = await self._login.identify(
-            username, password, request.address, request.tls, request.anonymous
+            username, password, request.address, request.tls, request.terms.anonymous
         )
         if isinstance(who, Identity):
             if who.username is None and password is not None:

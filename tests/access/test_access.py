@@ -395,9 +395,25 @@ def test_a_name_with_a_wildcard_or_slash_is_never_put_into_a_pattern(
     acl = acl_of(tmp_path, f"pattern a/%{letter}\npattern b/#")
     for topic in ("a/x", f"a/{name}", "a/", f"a/%{letter}"):
         assert not acl.decide(identity, Action.PUBLISH, topic)
+    # mosquitto lets no pattern give anything to a name with a wildcard, whether it is in it or not.
+    is_served = "+" not in name and "#" not in name
     for filter in ("a/#", "a/+", "#"):
-        assert bool(acl.decide(identity, Action.SUBSCRIBE, filter)) is (filter == "#")
-    assert acl.decide(identity, Action.PUBLISH, "b/x")
+        allowed = bool(acl.decide(identity, Action.SUBSCRIBE, filter))
+        assert allowed is (filter == "#" and is_served)
+    for action in (Action.PUBLISH, Action.RECEIVE):
+        assert bool(acl.decide(identity, action, "b/x")) is is_served
+    if not is_served:
+        assert "who has + or #" in str(acl.explain(identity, "b/x"))
+
+
+def test_a_wildcard_in_an_id_leaves_others_their_rights(tmp_path: Path) -> None:
+    """Decisions about receivers are kept by kind of id."""
+    acl = acl_of(tmp_path, "pattern b/#\nuser u\ntopic own")
+    for _ in range(2):
+        for client_id, allowed in (("a/b", True), ("a+b", False), ("ab", True), ("a/+", False)):
+            identity = Identity("u", client_id)
+            assert bool(acl.decide(identity, Action.RECEIVE, "b/x")) is allowed
+            assert acl.decide(identity, Action.RECEIVE, "own")
 
 
 def test_a_pattern_that_denies_holds_for_names_that_cannot_be_put_in(tmp_path: Path) -> None:

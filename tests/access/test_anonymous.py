@@ -104,6 +104,7 @@ async def test_a_plugin_does_not_let_in_whom_the_listener_does_not(tmp_path: Pat
         ({"bind": "127.0.0.1:1", "anonymous": True}, ["come in here"]),
         ({"bind": "127.0.0.1:1", "anonymous": False}, []),
         ({"bind": "unix:/tmp/x", "anonymous": True}, ["come in here"]),
+        ({"bind": "unix:/tmp/x", "anonymous": "always"}, ["with any user name"]),
     ],
 )
 def test_check_says_so(tmp_path: Path, listener: dict[str, Any], told: list[str]) -> None:
@@ -113,3 +114,23 @@ def test_check_says_so(tmp_path: Path, listener: dict[str, Any], told: list[str]
     for text in told:
         assert any(text in warning for warning in warnings), warnings
     assert told or not warnings
+
+
+async def test_always_means_that_no_name_is_checked(tmp_path: Path) -> None:
+    """And that nobody has a user's rights by saying to be one, not even with the password."""
+    listeners = [{"bind": "127.0.0.1:0", "anonymous": "always"}, {"bind": "127.0.0.1:0"}]
+    app = App(settings_of(tmp_path, listeners=listeners))
+    await app.start()
+    try:
+        (always, other) = (port for _, port in app.addresses)
+        for username in (None, "ann", "nobody", ""):
+            assert await log_in(always, username) == (0, [0, 0x80])
+        assert await log_in(other, "ann") == (0, [0, 0])
+        assert await log_in(other, "nobody") == await log_in(other, None) == (5, [])
+    finally:
+        await app.stop()
+
+
+def test_always_is_nothing_for_the_web(tmp_path: Path) -> None:
+    with pytest.raises(config.ConfigError, match=r"must not be always for the web"):
+        settings_of(tmp_path, listeners=[{"bind": ":1", "protocol": "web", "anonymous": "always"}])

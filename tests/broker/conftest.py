@@ -11,7 +11,7 @@ from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.client import ClientHandler
 from appliance.broker.delivery import Delivery, UnreleasedPublish, held_size
-from appliance.broker.limits import Limits, UserLimits
+from appliance.broker.limits import USUAL_TERMS, Limits, Terms, UserLimits
 from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.broker.message import Message
 from appliance.broker.ports import Exchange
@@ -240,11 +240,11 @@ class FakeTransport:
 class Peer:
     """The client at the other end: says packets, and hears the packets that come back."""
 
-    def __init__(self, broker: Broker, version: int = 5) -> None:
+    def __init__(self, broker: Broker, version: int = 5, terms: Terms = USUAL_TERMS) -> None:
         self.broker = broker
         self.version = version
         self.transport = FakeTransport()
-        self.client = ClientHandler(broker, self.transport)
+        self.client = ClientHandler(broker, self.transport, terms)
         self._packet_id = 0
 
     @property

@@ -150,13 +150,40 @@ def test_names_are_checked_where_mosquitto_takes_any(tmp_path: Path) -> None:
         "per_listener_settings true\nlistener 1883\npassword_file pw\n"
         "listener 1884\nallow_anonymous true\n"
     )
+    found = convert(tmp_path, f"{text}acl_file acl\n", pw=f"alice:{HASH}\n", acl="topic a\n")
     said = "mosquitto.conf:5: allow_anonymous: who gives a user name is checked here"
-    assert said in told(convert(tmp_path, text, pw=f"alice:{HASH}\n"))
+    assert said in told(found)
+    assert settings(found)["broker"]["listeners"][1] == {"bind": ":1884", "anonymous": True}
     everywhere = text.replace("per_listener_settings true\n", "")
     assert "is checked here" not in told(convert(tmp_path, everywhere, pw=""))
 
 
-@pytest.mark.parametrize("line", ["psk_hint x", "mount_point x/", "enable_proxy_protocol 2"])
+def test_without_rules_any_name_is_taken(tmp_path: Path) -> None:
+    """As in mosquitto, where it makes no difference who somebody is."""
+    text = (
+        "per_listener_settings true\nlistener 1883\npassword_file pw\n"
+        "listener 1884\nallow_anonymous true\n"
+    )
+    found = convert(tmp_path, text, pw=f"alice:{HASH}\n")
+    listeners = settings(found)["broker"]["listeners"]
+    assert listeners == [{"bind": ":1883"}, {"bind": ":1884", "anonymous": "always"}]
+    assert "is checked here" not in told(found)
+    only = settings(convert(tmp_path, "listener 1883\nallow_anonymous true\n"))["broker"]
+    assert only["listeners"] == [{"bind": ":1883", "anonymous": "always"}]
+    plugin = "listener 1883\nallow_anonymous true\nplugin /x.so\n"
+    assert "always" not in str(settings(convert(tmp_path, plugin)))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "psk_hint x",
+        "mount_point x/",
+        "enable_proxy_protocol 2",
+        "use_subject_as_username true",
+        "use_username_as_clientid true",
+    ],
+)
 def test_a_listener_that_keeps_clients_apart_is_left_out(tmp_path: Path, line: str) -> None:
     found = convert(tmp_path, f"listener 1883\nlistener 1884\n{line}\n")
     assert settings(found)["broker"]["listeners"] == [{"bind": ":1883"}]
@@ -219,7 +246,10 @@ def test_anonymous_in_general_and_of_a_listener(tmp_path: Path) -> None:
     text = "allow_anonymous true\nlistener 1883\nlistener 1884\nlistener_allow_anonymous false\n"
     broker = settings(convert(tmp_path, text))["broker"]
     assert broker["anonymous"] is True
-    assert broker["listeners"] == [{"bind": ":1883"}, {"bind": ":1884", "anonymous": False}]
+    assert broker["listeners"] == [
+        {"bind": ":1883", "anonymous": "always"},
+        {"bind": ":1884", "anonymous": False},
+    ]
 
 
 def test_anonymous_of_a_listener_without_rules(tmp_path: Path) -> None:
@@ -229,7 +259,7 @@ def test_anonymous_of_a_listener_without_rules(tmp_path: Path) -> None:
     )
     rules = "topic read only/this\nuser alice\ntopic read a\n"
     found = convert(tmp_path, text, pw=f"alice:{HASH}\n", acl=rules)
-    assert settings(found)["broker"]["listeners"][0]["anonymous"] is True
+    assert settings(found)["broker"]["listeners"][0]["anonymous"] == "always"
     decided = acl(found, tmp_path)
     assert may(decided, None, Action.PUBLISH, "b")
     assert not may(decided, "alice", Action.PUBLISH, "b")
@@ -257,7 +287,6 @@ def test_listeners_with_other_rules_let_nobody_in_by_mistake(tmp_path: Path) -> 
         ("use_identity_as_username true", ""),
         ("", "crlfile crl.pem"),
         ("crlfile crl.pem", "crlfile other.pem"),
-        ("use_identity_as_username true", "use_subject_as_username true"),
     ],
 )
 def test_listeners_that_ask_for_other_certificates_are_left_out(

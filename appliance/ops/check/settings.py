@@ -76,8 +76,10 @@ def _listeners(settings: Settings) -> Iterator[Finding]:
         if not settings.broker.lets_in_anonymous(listener):
             continue
         if listener.anonymous:
-            text = "clients without a user name come in here, with what the ACL gives to everyone"
-            yield Finding("warning", subject, text)
+            who = "clients without a user name come in here"
+            if listener.anonymous == "always":
+                who = "whoever comes is let in here, with any user name, and is anonymous"
+            yield Finding("warning", subject, f"{who}, with what the ACL gives to everyone")
         if not listener.tls and not listener.bind.loopback:
             text = "anonymous and without TLS: whoever is on the network is in, and reads along"
             yield Finding("warning", subject, text)
