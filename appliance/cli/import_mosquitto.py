@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from appliance.importing import Imported
 
 
+# Nobody reads more: with a password file of thousands of users it may be one line for each.
+_MAX_LINES = 500
+
+
 def import_mosquitto(
     file: Annotated[
         Path, typer.Argument(metavar="MOSQUITTO_CONF", help="mosquitto's configuration file.")
@@ -81,8 +85,10 @@ def _report(imported: Imported, directory: Path) -> None:
     for title, lines in (("To be done:", to_do), ("Different here:", different)):
         if lines:
             typer.secho(f"\n{title}", bold=True)
-        for line in lines:
+        for line in lines[:_MAX_LINES]:
             typer.echo(line.translate(VISIBLE))
+        if len(lines) > _MAX_LINES:
+            typer.echo(f"and {len(lines) - _MAX_LINES} more")
     typer.echo(
         f"\nOf {imported.options} options {imported.carried} are carried over without a change.\n"
         f"Next: appliance check -c {shown(directory / 'appliance.yaml')}"

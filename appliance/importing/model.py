@@ -11,6 +11,10 @@ from appliance.importing.reading import Statement, words
 
 DEFAULT_PORT = 1883
 
+# Of listeners, and of bridges: with more the file was made by mistake.
+_MAX_BLOCKS = 1000
+_MAX_HOST = 255
+
 _NOWHERE = Place("", 0)
 
 
@@ -166,6 +170,9 @@ class _Sorter:
 
     def _open_listener(self, statement: Statement) -> None:
         place = statement.place
+        if len(self._named) >= _MAX_BLOCKS:
+            self._problems.append((place, f"there are more than {_MAX_BLOCKS} listeners"))
+            return
         port, *rest = words(statement.value) or [""]
         listener = Listener(place=place)
         if not port.isdecimal() or not port.isascii() or len(port) > 5 or int(port) > 65535:
@@ -176,10 +183,17 @@ class _Sorter:
             listener.port, listener.path = 0, rest[0]
         else:
             listener.port, listener.host = int(port), rest[0] if rest else ""
+            if len(listener.host) > _MAX_HOST:
+                text = f"listener has an address of {len(listener.host)} characters"
+                self._problems.append((place, text))
         self._named.append(listener)
         self._listener[place.file] = listener
 
     def _open_bridge(self, statement: Statement) -> None:
+        if len(self._bridges) >= _MAX_BLOCKS:
+            text = f"there are more than {_MAX_BLOCKS} connections"
+            self._problems.append((statement.place, text))
+            return
         if any(bridge.name == statement.value for bridge in self._bridges):
             text = f"there are two connections {statement.value}"
             self._problems.append((statement.place, text))

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-# Nobody reads more of them.
+# Nobody reads more of them, or longer ones: a file may name a path of a megabyte.
 _MAX_PROBLEMS = 50
+_MAX_LENGTH = 400
 
 
 class Place(NamedTuple):
@@ -29,7 +30,15 @@ class Note:
     to_do: bool = False
 
     def __str__(self) -> str:
-        return f"{self.place}: {self.subject}: {self.text}"
+        return _short(f"{self.place}: {self.subject}: {self.text}")
+
+
+def _short(line: str) -> str:
+    """A line without its middle, where it is longer than anybody reads."""
+    if len(line) <= _MAX_LENGTH:
+        return line
+    half = _MAX_LENGTH // 2
+    return f"{line[:half]} … {line[-half:]}"
 
 
 class ImportProblemsError(Exception):
@@ -37,7 +46,7 @@ class ImportProblemsError(Exception):
 
     def __init__(self, problems: list[tuple[Place, str]]) -> None:
         """A list that is longer than anybody reads is cut."""
-        lines = [f"{place}: {text}" for place, text in problems[:_MAX_PROBLEMS]]
+        lines = [_short(f"{place}: {text}") for place, text in problems[:_MAX_PROBLEMS]]
         if len(problems) > _MAX_PROBLEMS:
             lines.append(f"and {len(problems) - _MAX_PROBLEMS} more")
         super().__init__("\n".join(lines))
@@ -47,10 +56,13 @@ class ImportProblemsError(Exception):
 class Notes:
     """The notes of an import, in the order in which they were found."""
 
-    found: list[Note] = field(default_factory=list)
+    _found: dict[Note, None] = field(default_factory=dict)
+
+    @property
+    def found(self) -> list[Note]:
+        """All of them."""
+        return list(self._found)
 
     def add(self, place: Place, subject: str, text: str, *, to_do: bool = False) -> None:
         """Add a note, unless it has been said."""
-        note = Note(place, subject, text, to_do)
-        if note not in self.found:
-            self.found.append(note)
+        self._found.setdefault(Note(place, subject, text, to_do))

@@ -13,6 +13,8 @@ from appliance.importing.options import OPTIONS, PLUGIN_PREFIXES, Kind, option_o
 
 _MAX_SIZE = 1 << 20  # of a file: mosquitto's commented example has 40 KiB
 _MAX_FILES = 1000
+_MAX_LINE = 70_000  # more than a topic has, the longest value there is
+_HEAD_SIZE = 4096
 _FLAGS = {"true": True, "1": True, "false": False, "0": False}
 _NUMBER_DIGITS = 15
 
@@ -58,6 +60,17 @@ def _exists(path: Path) -> bool:
         return False
 
 
+def _is_binary(path: Path) -> bool:
+    """Whether a file that is no UTF-8 is no text at all."""
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return b"\0" in file.read(_HEAD_SIZE)
+    except OSError:
+        return False
+
+
 class Reader:
     """Reads the main file and those that it includes; collects all mistakes."""
 
@@ -85,6 +98,9 @@ class Reader:
         try:
             text = read_text(path, "name mosquitto's configuration file", _MAX_SIZE)
         except AccessFileError as error:
+            if _is_binary(path):
+                self.problems.append((place, "is a binary file, and no configuration"))
+                return
             found = [(Place(place.file, each.line), each.message) for each in error.problems]
             self.problems += found
             return
@@ -92,7 +108,12 @@ class Reader:
             self.problems.append((place, "is a binary file, and no configuration"))
             return
         for number, line in enumerate(text.split("\n"), 1):
-            if not line.startswith("#"):
+            if line.startswith("#"):
+                continue
+            if len(line) > _MAX_LINE:
+                text = f"the line has {len(line)} characters, and no option is so long"
+                self.problems.append((Place(place.file, number), text))
+            else:
                 self._statement(Place(place.file, number), line.rstrip("\r"), is_main)
 
     def _statement(self, place: Place, line: str, is_main: bool) -> None:

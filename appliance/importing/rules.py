@@ -19,9 +19,12 @@ _ROBOT = "{robot}"  # which is replaced here
 
 def carry_over(text: str, name: str, notes: Notes) -> str:
     """The rules as they mean the same here, line by line. Raises ImportProblemsError."""
-    lines = [
-        _carried(line, Place(name, number), notes) for number, line in enumerate(_lines(text), 1)
-    ]
+    lines = []
+    for number, line in enumerate(_lines(text), 1):
+        if line.split(" ", 1)[0] == "include":
+            problem = "mosquitto's rules have no `include`"
+            raise ImportProblemsError([(Place(name, number), problem)])
+        lines.append(_carried(line, Place(name, number), notes))
     carried = "\n".join(lines)
     _check(carried, name)
     return carried if carried.endswith("\n") else f"{carried}\n"

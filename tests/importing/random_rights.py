@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -58,7 +58,7 @@ from appliance.mqtt.packets import (
 from importing.random_files import ROBOT, Case, Login, Sent, make, make_certificates
 
 #: Seconds for one answer. A broker that gives none has failed.
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 #: The most listeners of a case.
 LISTENERS = 3
@@ -367,7 +367,8 @@ def _write(imported: Imported, directory: Path) -> config.Settings:
     settings = yaml.safe_load(path.read_text())
     settings["bridge"] = {"bus": "none"}
     settings.pop("upstreams", None)
-    settings["broker"].setdefault("limits", {})["failed_logins"] = 1000
+    limits = {"failed_logins": 1000, "connect_timeout": f"{PATIENCE:.0f} s"}
+    settings["broker"].setdefault("limits", {}).update(limits)
     path.write_text(yaml.safe_dump(settings))
     return config.load(path)
 
@@ -559,7 +560,7 @@ class _Comparison:
         return self._why_without_right(number, topic) or self._why_without_right(sender, topic)
 
 
-def run(seeds: range, say: Callable[[str], None]) -> tuple[list[str], Counter[str], int]:
+def run(seeds: Iterable[int], say: Callable[[str], None]) -> tuple[list[str], Counter[str], int]:
     """The faults of all seeds, what is less by reason, and how much was the same."""
     faults: list[str] = []
     less: Counter[str] = Counter()

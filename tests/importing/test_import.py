@@ -14,6 +14,7 @@ from command_line import run
 from appliance import config
 from appliance.access import Acl, Passwords
 from appliance.broker.values import Action, Identity
+from appliance.config.quantities import parse_size
 from appliance.importing import Imported, ImportProblemsError, import_mosquitto
 from appliance.importing.options import OPTIONS
 from appliance.ops.check import check
@@ -198,6 +199,30 @@ def test_an_option_before_all_listeners_is_told(tmp_path: Path) -> None:
     assert "limits" not in settings(found)["broker"]
 
 
+def test_what_a_listener_restricts(tmp_path: Path) -> None:
+    text = (
+        "retain_available false\nclientid_prefixes arm-\nmessage_size_limit 1024\n"
+        "listener 1883\nmax_qos 1\naccept_protocol_versions 5, 4\n"
+        "listener 1884\nmaximum_qos 2\naccept_protocol_versions 3,4,5\n"
+    )
+    found = convert(tmp_path, text)
+    everywhere = {"retain": False, "client_id_prefixes": ["arm-"]}
+    versions = {"protocol_versions": ["3.1.1", "5"]}
+    assert settings(found)["broker"]["listeners"] == [
+        {"bind": ":1883", "max_qos": 1, **everywhere, **versions},
+        {"bind": ":1884", **everywhere},
+    ]
+    assert settings(found)["broker"]["limits"] == {"payload_size": "1 KiB"}
+    loaded = config.loads(file(found, "appliance.yaml"), tmp_path / "appliance.yaml")
+    assert loaded.broker.listeners[0].terms().versions == {4, 5}
+
+
+def test_a_large_payload_finds_room_in_a_packet(tmp_path: Path) -> None:
+    limits = settings(convert(tmp_path, f"listener 1\nmessage_size_limit {20 << 20}\n"))["broker"]
+    assert limits["limits"]["payload_size"] == "20 MiB"
+    assert parse_size(limits["limits"]["packet_size"]) > 20 << 20
+
+
 # Who may do what
 
 
@@ -333,6 +358,43 @@ def test_rules_on_control_are_left_out(tmp_path: Path) -> None:
     assert "acl:2: topic readwrite $CONTROL/#: is left out" in told(found)
 
 
+@pytest.mark.parametrize(
+    ("line", "carried"),
+    [
+        ("pattern read dev-%u/#", None),
+        ("pattern write a/x%c", None),
+        ("topic read {robot}/a", None),
+        ("pattern deny dev-%u/%c/#", "pattern deny +/%c/#"),
+        ("topic deny a/{robot}/b", "topic deny a/+/b"),
+        ("topic read %u/dev-%c", "topic read %u/dev-%c"),
+        ("pattern read %u/%c/#", "pattern read %u/%c/#"),
+    ],
+)
+def test_a_rule_that_would_mean_something_else(
+    tmp_path: Path, line: str, carried: str | None
+) -> None:
+    """It gives no more than in mosquitto, and denies no less."""
+    found = convert(tmp_path, "listener 1\nacl_file acl\n", acl=f"user a\ntopic b\n{line}\n")
+    lines = file(found, "acl.conf").splitlines()
+    assert lines[:2] == ["user a", "topic b"]
+    assert lines[2] == (carried or f"# {line}")
+    assert (f"acl:3: {line}: " in told(found)) == (carried != line)
+
+
+def test_a_listener_at_which_nobody_can_come_in_is_left_out(tmp_path: Path) -> None:
+    text = (
+        "per_listener_settings true\nlistener 1883\npassword_file pw\n"
+        "listener 1884\nallow_anonymous false\n"
+    )
+    found = convert(tmp_path, text, pw=f"alice:{HASH}\n")
+    assert [each["bind"] for each in settings(found)["broker"]["listeners"]] == [":1883"]
+    assert "listener 1884 is left out: it has no users" in told(found)
+    tls = "listener 8883\ncertfile c\nkeyfile c\ncafile c\nuse_identity_as_username true\n"
+    found = convert(tmp_path, f"allow_anonymous true\nlistener 1883\n{tls}", c="x")
+    assert [each["bind"] for each in settings(found)["broker"]["listeners"]] == [":1883"]
+    assert "listener 8883 is left out: it takes the user from a certificate" in told(found)
+
+
 # General options
 
 
@@ -458,6 +520,11 @@ def test_a_bridge_that_cannot_be_is_left_out(tmp_path: Path, line: str, said: st
         ('connection a\naddress h\ntopic ""', "needs a local and a remote prefix"),
         ("acl_file x\nper_listener_settings true", "has to be before all options of access"),
         ("\0\1\2", "is a binary file"),
+        ("listener 1\nmax_qos 3", "mosquitto.conf:2: max_qos is one of 0, 1, 2"),
+        ("listener 1\naccept_protocol_versions 3,6", "has 3, 4 and 5, with commas, not '6'"),
+        ("listener 1 " + "x" * 300, "listener has an address of 300 characters"),
+        ("listener 1\nacl_file " + "x" * 900_000, "mosquitto.conf:2: the line has 900009 charact"),
+        ("listener 1\n" * 1001, "mosquitto.conf:1001: there are more than 1000 listeners"),
         ("#" * (2 << 20), "larger than 1 MiB"),
     ],
 )
@@ -465,6 +532,29 @@ def test_mistakes_are_told_with_their_line(tmp_path: Path, text: str, said: str)
     with pytest.raises(ImportProblemsError, match=re.escape(said)) as raised:
         convert(tmp_path, text)
     assert len(str(raised.value)) < 300
+
+
+def test_a_program_is_no_configuration(tmp_path: Path) -> None:
+    (tmp_path / MAIN).write_bytes(b"\x7fELF\0\0\xff\xfe" * 100)
+    with pytest.raises(ImportProblemsError, match=r"^mosquitto\.conf: is a binary file"):
+        import_mosquitto(tmp_path / MAIN, "r2d2")
+
+
+def test_rules_that_mosquitto_does_not_have(tmp_path: Path) -> None:
+    with pytest.raises(ImportProblemsError, match="acl:2: mosquitto's rules have no `include`"):
+        convert(tmp_path, "listener 1\nacl_file acl\n", acl="user a\ninclude other\n")
+
+
+def test_a_report_stays_short(tmp_path: Path) -> None:
+    """However long what it is about, and however much."""
+    users = "".join(f"user{number}:plain\n" for number in range(20_000))
+    text = f"listener 1\npassword_file pw\nacl_file {'x' * 60_000}\n"
+    found = convert(tmp_path, text, pw=users)
+    assert len(found.notes) > 20_000
+    assert max(map(len, map(str, found.notes))) < 500
+    with pytest.raises(ImportProblemsError) as raised:
+        convert(tmp_path, "listener 1\nacl_file acl\n", acl="topic " + "a/" * 60_000)
+    assert len(str(raised.value)) < 500
 
 
 def test_all_mistakes_are_told_and_not_too_many(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from importing.random_files import ROBOT, Case, Login, Sent
 from importing.random_rights import MOSQUITTO, Result, Seen, judge, run
 
 #: A few of each kind: by listener and in general, with TLS and without, with rules and without.
-SEEDS = range(1, 7)
+SEEDS = (24, 27, 43, 49, 68, 71)
 
 LOGIN = Login(1883, False, 5, "c1", "alice", "one", None)
 OTHER = Login(1883, False, 5, "c2", "bob", "two", None)
@@ -20,7 +20,7 @@ OTHER = Login(1883, False, 5, "c2", "bob", "two", None)
 def test_nothing_is_allowed_that_mosquitto_does_not_allow() -> None:
     faults, less, same = run(SEEDS, print)
     assert faults == []
-    assert same > 500, less
+    assert same > 800, less
 
 
 def judged(theirs: Seen, ours: Seen, *notes: str) -> Result:
