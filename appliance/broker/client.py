@@ -348,6 +348,8 @@ class ClientHandler:
                 return
         if size > self._payload_size and route.allowed:
             counters.cost += PACKET_COST
+            if first & self._refused_flags:
+                raise self._unsupported(first)
             self._refuse_size(session, route.topic, first >> 1 & 3, packet_id, payload)
             return
         targets = route.targets

@@ -79,13 +79,19 @@ class _Converter:
         if not names and not all(anonymous.values()):
             self._tell_of_nobody()
         for index, listener in enumerate(self._listeners):
-            if anonymous[index] and not self._takes_any_name(listener):
+            if (
+                anonymous[index]
+                and not listener.names_by_certificate
+                and not self._takes_any_name(listener)
+            ):
                 self._tell_of_strangers(listener)
         overall = self._configuration.general.flag(
             "allow_anonymous", self._configuration.local_only
         )
         if self._configuration.per_listener:
             overall = False
+        if self._configuration.local_only and not overall:
+            self._tell_of_local()
         differing: dict[int, Anonymous] = {
             index: each for index, each in anonymous.items() if each != overall
         }
@@ -213,6 +219,13 @@ class _Converter:
         if not by_certificate and self._listeners:
             text = "nobody can log in yet: appliance user add NAME"
             self._notes.add(Place("users.passwd", 0), "no user", text, to_do=True)
+
+    def _tell_of_local(self) -> None:
+        """mosquitto 2.0 without a listener lets in whoever is on this computer."""
+        statement = self._configuration.general.get("allow_anonymous")
+        if statement is not None:
+            text = "counts here: mosquitto 2.0 takes no notice of it where no listener is named"
+            self._notes.add(statement.place, "allow_anonymous", text)
 
     def _tell_of_strangers(self, listener: Listener) -> None:
         security = self._configuration.security(listener)

@@ -178,6 +178,18 @@ def test_a_payload_is_as_large_as_allowed(
 
 
 @both
+@pytest.mark.parametrize("qos", [0, 2])
+def test_what_the_listener_does_not_take_ends_the_connection_whatever_its_size(
+    broker: Broker, version: int, qos: int
+) -> None:
+    broker.use(Limits(payload_size=10), broker.features)
+    peer = joined(broker, version, Terms(max_qos=1, retain=False))
+    peer.send(Publish("a", b"0123456789.", qos, qos == 0, False, 7 if qos else None))
+    assert peer.received() == ([Disconnect(0x9B if qos else 0x9A)] if version == 5 else [])
+    assert peer.transport.closed
+
+
+@both
 def test_a_will_is_no_larger_either(broker: Broker, version: int) -> None:
     broker.use(Limits(payload_size=10), broker.features)
     code = refused(broker, version, Terms(), will=Will("a", b"0123456789."))

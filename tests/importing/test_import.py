@@ -159,6 +159,13 @@ def test_names_are_checked_where_mosquitto_takes_any(tmp_path: Path) -> None:
     assert "is checked here" not in told(convert(tmp_path, everywhere, pw=""))
 
 
+def test_without_a_listener_mosquitto_lets_in_everybody(tmp_path: Path) -> None:
+    found = convert(tmp_path, "allow_anonymous false\npassword_file pw\n", pw=f"alice:{HASH}\n")
+    assert "mosquitto.conf:1: allow_anonymous: counts here" in told(found)
+    assert "anonymous" not in str(settings(found))
+    assert "counts here" not in told(convert(tmp_path, "allow_anonymous false\nlistener 1\n"))
+
+
 def test_without_rules_any_name_is_taken(tmp_path: Path) -> None:
     """As in mosquitto, where it makes no difference who somebody is."""
     text = (
