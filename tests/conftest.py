@@ -24,6 +24,9 @@ settings.load_profile("default")
 
 IN_CI = os.environ.get("CI") == "true"
 
+# What the tests start is not announced on the network of the computer that they run on.
+os.environ["APPLIANCE_MDNS"] = "off"
+
 
 def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:
     if IN_CI and report.skipped and not hasattr(report, "wasxfail"):

@@ -37,6 +37,7 @@ from appliance.certs import (
 from appliance.certs.settings import tls_contexts
 from appliance.config import (
     OPEN_WITH_SECRETS,
+    Bind,
     Settings,
     is_open_with_secrets,
 )
@@ -46,6 +47,8 @@ from appliance.host.watch import watch
 from appliance.management.mqtt_calls import ManagementCalls
 from appliance.management.phone_certificates import PhoneCertificates
 from appliance.management.verbs import Verbs
+from appliance.mdns import settings as mdns_settings
+from appliance.mdns.process import AnnouncerProcess
 from appliance.net.callbacks import Entries, contained_proxy
 from appliance.net.listeners import Admission, Listeners
 from appliance.ops.audit import Audit, AuditError
@@ -124,6 +127,8 @@ class App:
         self._certificates_due = asyncio.Event()
         self._status: status.Status | None = None
         self._verbs: Verbs | None = None
+        self._announcer = AnnouncerProcess()
+        self._announced_host = mdns_settings.new_host()
         #: How late the clock's ticks are, and so everything else on the loop.
         self._lag = Histogram()
 
@@ -226,6 +231,7 @@ class App:
                 self.audit,
                 self._links,
                 self._enrolments,
+                self._announce,
             )
         )
         self._status = status.Status(
@@ -238,6 +244,7 @@ class App:
                 self.upstreams,
                 self._reload,
                 tls.warnings if tls is not None else list,
+                self._announcer,
                 self._crashes.previous if self._crashes is not None else None,
             )
         )
@@ -249,6 +256,8 @@ class App:
         state = f"{settings.robot}/_appliance/state"
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
+        self._announce()
+        self._run_in_background(self._announcer.run)
 
     def _open_store(self) -> SessionStore:
         wanted = self.settings.broker.store
@@ -403,6 +412,21 @@ class App:
         calls = ManagementCalls(self.broker, self._entries, self._verbs)
         calls.start()
         self._stack.push_async_callback(calls.stop)
+
+    def _announce(self) -> None:
+        """Announce on the network what is in force now."""
+        self.broker.faults.run("app.announce", self._announce_listeners, otherwise=None)
+
+    def _announce_listeners(self) -> None:
+        listening = [
+            mdns_settings.Listening(Bind(host, port), each.context is not None, each.protocol)
+            for host, port, each in self._listeners.bound()
+        ]
+        authority = self._tls.authority() if self._tls is not None else b""
+        settings, host = self._reload.settings, self._announced_host
+        self._announcer.announce(
+            mdns_settings.announcement(settings, listening, authority, host, os.environ)
+        )
 
     def _start_clock(self, loop: asyncio.AbstractEventLoop) -> None:
         """Tick every TICK seconds; publish `$SYS` every `broker.sys_interval`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -71,6 +71,8 @@ class ReloadParts:
     audit: Audit | None
     links: Links
     enrolments: Enrolments
+    #: Announces on the network what is in force now.
+    announce: Callable[[], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +157,7 @@ class Reload:
             tls = self._parts.tls
             if tls is not None:
                 self._take_certificates(tls, await asyncio.to_thread(tls.prepare))
+                self._parts.announce()
 
     async def _run(self) -> list[str]:
         parts = self._parts
@@ -189,6 +192,7 @@ class Reload:
         parts.broker.flush()
         # Links that the routes change are among them: how late a command may be depends on these.
         changed += await parts.links.replace(settings)
+        parts.announce()
         if parts.audit is not None and changed:
             parts.audit.changed(", ".join(changed), **asdict(rights))
         return changed

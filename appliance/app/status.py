@@ -22,6 +22,7 @@ from appliance.broker.meter import Meter
 from appliance.certs.settings import tls_files
 from appliance.config import Settings, about_size, format_duration
 from appliance.host.clock import RELEASED, is_unset
+from appliance.mdns.process import AnnouncerProcess
 from appliance.net.listeners import Listeners
 from appliance.ros.bridge import Bridge
 from appliance.ros.status import RouteStatus
@@ -50,6 +51,7 @@ class StatusParts:
     upstreams: Sequence[Uplink]
     reload: Reload
     warnings: Callable[[], list[str]]
+    announcer: AnnouncerProcess
     #: The crash report of the last run, if it crashed.
     crash: Path | None = None
 
@@ -106,6 +108,7 @@ class Status:
             "short": list(self._short()),
             "ros": ros,
             "routes": routes,
+            "mdns": parts.announcer.status(),
             "upstreams": [uplink.status().as_json() for uplink in parts.upstreams],
             "reload": self._reload(),
             "errors": self._errors(),
@@ -304,6 +307,8 @@ class Status:
             yield f"ROS: {problem}"
         elif problem:
             yield f"there is no bridge to ROS: {problem}"
+        if report["mdns"]["problem"]:
+            yield f"mDNS: {report['mdns']['problem']}"
         for upstream in report["upstreams"]:
             for text in upstream_warnings(upstream):
                 yield f"upstream {upstream['name']}: {text}"

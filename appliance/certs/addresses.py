@@ -7,16 +7,16 @@ import re
 import socket
 import threading
 from ipaddress import IPv4Address, IPv6Address
-from pathlib import Path
 from typing import Final, TypeAlias
 
 import psutil
+
+from appliance.host.interfaces import temporary_addresses
 
 Address: TypeAlias = IPv4Address | IPv6Address
 
 DNS_NAME: Final = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?:\.[A-Za-z0-9_-]{1,63})*\.?")
 _RESOLVER_PATIENCE: Final = 3.0  # seconds
-_IFA_F_TEMPORARY: Final = 0x01  # linux/if_addr.h
 
 
 def local_names() -> tuple[list[str], list[Address]]:
@@ -32,7 +32,7 @@ def local_names() -> tuple[list[str], list[Address]]:
     names = [hostname, _full_name(hostname), f"{short}.local", "localhost"]
     names = [name.lower().rstrip(".") for name in names if DNS_NAME.fullmatch(name)]
     addresses: set[Address] = {IPv4Address("127.0.0.1"), IPv6Address("::1")}
-    temporary = _temporary()
+    temporary = temporary_addresses()
     for entries in psutil.net_if_addrs().values():
         for entry in entries:
             if entry.family in (socket.AF_INET, socket.AF_INET6):
@@ -50,13 +50,3 @@ def _full_name(hostname: str) -> str:
     thread.start()
     thread.join(_RESOLVER_PATIENCE)
     return found[-1] if not found[-1].endswith(".arpa") else hostname
-
-
-def _temporary() -> set[Address]:
-    """The temporary addresses (RFC 8981), which only Linux lists."""
-    try:
-        lines = Path("/proc/net/if_inet6").read_text().splitlines()
-    except OSError:
-        return set()
-    fields = [line.split() for line in lines]
-    return {IPv6Address(bytes.fromhex(f[0])) for f in fields if int(f[4], 16) & _IFA_F_TEMPORARY}

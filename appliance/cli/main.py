@@ -21,6 +21,7 @@ from appliance.cli.console import CommandError
 from appliance.cli.doctor import doctor
 from appliance.cli.enrol import user_enrol
 from appliance.cli.fastdds import fastdds
+from appliance.cli.find import find
 from appliance.cli.import_mosquitto import import_mosquitto
 from appliance.cli.install import install, uninstall
 from appliance.cli.log import log
@@ -39,7 +40,7 @@ app = typer.Typer(
 )
 # In this order in the help.
 SETTING_UP = (init, run, check, reload)
-LOOKING = (status, top, doctor, log, routes, upstream)
+LOOKING = (find, status, top, doctor, log, routes, upstream)
 USING = (pub, sub, call, goal)
 for command in (*SETTING_UP, *LOOKING, *USING, demo, fastdds, install, uninstall, bench):
     app.command()(command)

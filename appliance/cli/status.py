@@ -80,6 +80,7 @@ def _lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "routes", f"{routes['count']}, which carry {routes['bridged']} topics and calls now"
     for sick in routes["sick"]:
         yield "", f"{sick['route']}: {sick['problem']}"
+    yield "mDNS", _mdns(report["mdns"])
     for number, link in enumerate(report["upstreams"]):
         yield "" if number else "upstreams", _upstream(link)
     yield "last reload", _reload(report["reload"])
@@ -107,6 +108,16 @@ def _ros(report: dict[str, Any]) -> str:
         return "is being joined"
     state = "was lost" if report["state"] == "lost" else "is not there yet"
     return f"{state}, and tried again: {report['problem']}"
+
+
+def _mdns(report: dict[str, Any]) -> str:
+    if report["state"] == "off":
+        return f"off: {report['reason']}"
+    if report["state"] == "announced":
+        return f"announced as {report['name']} on {'; '.join(report['links'])}"
+    if report["state"] == "waiting":
+        return "not announced: there is no network"
+    return "is being started" if report["state"] == "starting" else "NOT announced"
 
 
 def _upstream(link: dict[str, Any]) -> str:

@@ -291,6 +291,7 @@ class BrokerSection(_Section):
     users: FilePath = Path("users.passwd")
     acl: FilePath = Path("acl.conf")
     anonymous: bool = False
+    mdns: bool = True
     tls: TlsSection = _section()
     limits: LimitsSection = _section()
     audit: AuditSection = _section()

@@ -156,6 +156,11 @@ class Listeners:
         """Each listener's address, as the log shows it, and its settings."""
         return [(str(sock), sock.settings) for sock in self._sockets]
 
+    def bound(self) -> list[tuple[str, int, ListenerSettings]]:
+        """The address, not a name for it, the port and the settings of each TCP listener; an empty
+        address is all of this computer's."""
+        return [sock.bound for sock in self._sockets if sock.settings.path is None]
+
     def prepare(self, settings: list[ListenerSettings]) -> list[_ListeningSocket]:
         """Open the sockets for these settings, for `take`; sockets that exist are reused.
 
@@ -392,6 +397,12 @@ class _ListeningSocket:
     def __str__(self) -> str:
         host, port = self.address
         return host if self.settings.path is not None else f"{host or '*'}:{port}"
+
+    @property
+    def bound(self) -> tuple[str, int, ListenerSettings]:
+        """See `Listeners.bound`."""
+        host, port = self._socket.getsockname()[:2]
+        return host if self.settings.host else "", port, self.settings
 
     def use(self, settings: ListenerSettings) -> None:
         """Apply these settings to connections that are accepted from now on."""

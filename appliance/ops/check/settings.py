@@ -15,6 +15,8 @@ from appliance import certs
 from appliance.access import AccessFileError, Acl, Passwords
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import OPEN_WITH_SECRETS, Settings, is_open_with_secrets
+from appliance.mdns.announcement import label
+from appliance.mdns.settings import Listening, announcement
 from appliance.ops.check.bridge import bridge
 from appliance.ops.check.plugins import plugin_settings
 from appliance.ops.check.readable import readable
@@ -28,9 +30,9 @@ from appliance.store.inspection import summarise
 def check(settings: Settings) -> Iterator[Finding]:
     """Findings about everything that the settings refer to, including those that are ok."""
     yield Finding("ok", str(settings.file or "settings"), f"robot {settings.robot!r}")
-    parts = [_listeners, _access, _store, _audit, _plugins, bridge, upstreams, readable]
+    parts = [_listeners, _mdns, _access, _store, _audit, _plugins, bridge, upstreams, readable]
     if any(listener.tls for listener in settings.broker.listeners):
-        parts.insert(2, _certificates)
+        parts.insert(3, _certificates)
     for part in parts:
         with _warnings() as logged:
             yield from part(settings)
@@ -86,6 +88,20 @@ def _listeners(settings: Settings) -> Iterator[Finding]:
     if settings.broker.anonymous:
         text = "clients without a user name come in, and may do what the ACL gives to everyone"
         yield Finding("warning", "broker.anonymous", text)
+
+
+def _mdns(settings: Settings) -> Iterator[Finding]:
+    listening = [
+        Listening(each.bind, each.tls, each.protocol) for each in settings.broker.listeners
+    ]
+    wanted = announcement(settings, listening, b"", "", os.environ)
+    if isinstance(wanted, str):
+        yield Finding("ok", "mDNS", f"not announced on the network: {wanted}")
+    else:
+        ports = ", ".join(f"{each.kind.partition('.')[0]} {each.port}" for each in wanted.services)
+        name = label(wanted.robot)
+        text = f"announced on the network as {name!r} ({ports}); there `appliance find` lists it"
+        yield Finding("ok", "mDNS", text)
 
 
 def _access(settings: Settings) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from appliance.ops import check
 from appliance.ops.control import ControlError, NotRunningError, ask
 from appliance.ops.doctor.computer import clock, disk, files, memory
 from appliance.ops.doctor.links import links
+from appliance.ops.doctor.mdns import mdns
 from appliance.ops.doctor.ports import ports
 from appliance.ops.doctor.ros import ros
 from appliance.ops.doctor.secrets import certificates, permissions
@@ -50,9 +51,9 @@ def examine(path: Path | None) -> Iterator[Finding]:
         yield from _running(running)
     if settings is not None:
         yield from check.check(settings)
-    parts: list[Part] = [ports, clock, disk, memory, files]
+    parts: list[Part] = [ports, mdns, clock, disk, memory, files]
     if settings is not None:
-        parts[2:2] = [certificates, permissions]
+        parts[3:3] = [certificates, permissions]
         parts.append(links)
     for part in (*parts, ros):
         try:
