@@ -47,6 +47,8 @@ class AnnouncerProcess:
         self._wanted: Announcement | str = "not started"
         self._changed = asyncio.Event()
         self._process: Process | None = None
+        #: Whether its input was ended, as nothing was to be announced.
+        self._is_ending = False
         #: What it has said last: its name, links and problem.
         self._said: dict[str, Any] = {}
         #: Why it has ended; empty while it runs.
@@ -100,11 +102,11 @@ class AnnouncerProcess:
                 why = await self._run_once()
             except OSError as error:
                 why = f"cannot be started: {error.strerror or error}"
-            if isinstance(self._wanted, str):  # it was ended
+            if not why:
                 continue
             if loop.time() - began > STEADY:
                 delay = self._first_delay
-            self._said, self._failure = {}, f"the announcing program {why}"
+            self._failure = f"the announcing program {why}"
             log.warning("mDNS: %s; it is started again in %g s", self._failure, delay)
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), delay)
@@ -112,7 +114,8 @@ class AnnouncerProcess:
             self.restarts += 1
 
     async def _run_once(self) -> str:
-        """Run it until its end; returns why that was."""
+        """Run it until its end; returns why that was, empty when it was ended."""
+        self._is_ending = False
         process = await asyncio.create_subprocess_exec(
             *self._command,
             stdin=PIPE,
@@ -126,17 +129,19 @@ class AnnouncerProcess:
             self._hand_over(process)
             last = await self._read(process)
         finally:
-            self._process = None
+            self._process, self._said = None, {}
             await _end(process)
-        self._said = {}
+        if self._is_ending:
+            return ""
         return f"ended with {process.returncode}{f': {last}' if last else ''}"
 
     def _hand_over(self, process: Process) -> None:
         """Tell it what is to be announced; the end of its input when nothing is."""
         assert process.stdin is not None
         if isinstance(self._wanted, str):
+            self._said, self._is_ending = {}, True
             process.stdin.close()
-        elif not process.stdin.is_closing():
+        elif not self._is_ending:
             process.stdin.write(self._wanted.to_line())
 
     async def _read(self, process: Process) -> str:
@@ -189,9 +194,18 @@ async def _end(process: Process) -> None:
     process.stdin.close()
     try:
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(process.wait(), FAREWELL)
+            await asyncio.wait_for(_ended(process), FAREWELL)
     finally:
         if process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
+    with contextlib.suppress(asyncio.TimeoutError):
+        await asyncio.wait_for(_ended(process), FAREWELL)
+
+
+async def _ended(process: Process) -> None:
+    """Wait for its end, which is not seen before all that it has printed is read."""
+    assert process.stdout is not None
+    while await process.stdout.read(LINE_SIZE):
+        pass
     await process.wait()

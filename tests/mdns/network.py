@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -71,8 +72,9 @@ class Computer:
         return done.stdout
 
     def start(self, *command: str | Path, **options: Any) -> subprocess.Popen[Any]:
-        """A program that runs there until the computer is closed."""
-        process = subprocess.Popen(self.command(*command), **options)
+        """A program that runs there until the computer is closed, or the test is killed."""
+        bound = ("setpriv", "--pdeathsig", "KILL", *command)
+        process = subprocess.Popen(self.command(*bound), **options)
         self._running.append(process)
         return process
 
@@ -102,8 +104,9 @@ class Computer:
         """The services that avahi finds: interface, protocol, name, kind, domain, host, address,
         port, texts."""
         output = self.run("env", self.bus, "avahi-browse", "-rptk", kind)
-        lines = [line.split(";", 9) for line in output.splitlines() if line.startswith("=")]
-        return [each[1:] for each in lines]
+        # Blanks and the like are `\032`, in decimal.
+        plain = re.sub(r"\\(\d{3})", lambda match: chr(int(match[1])), output)
+        return [line.split(";", 9)[1:] for line in plain.splitlines() if line.startswith("=")]
 
     def close(self) -> None:
         for process in reversed(self._running):
