@@ -814,7 +814,7 @@ async def _renews(site: Site, patch: pytest.MonkeyPatch) -> None:
     site.app._certificates_due.set()
 
 
-@reach("app.reload", "signal.reload")
+@reach("app.announce", "app.reload", "signal.reload")
 async def _reloads(site: Site, patch: pytest.MonkeyPatch) -> None:
     os.kill(os.getpid(), signal.SIGHUP)
 

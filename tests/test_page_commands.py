@@ -44,6 +44,8 @@ NOT_RUN = {
     "make compiled": "compiles for minutes; tests/packaging/test_compiled.py does the same",
     "appliance clients kick tablet --user alice --host robot.local --ca ca.crt": "needs another"
     " client; tests/cli/test_clients.py disconnects one",
+    "appliance find": "asks the computer's own network; tests/mdns does it in networks of its own",
+    "appliance find --ca ca.crt": "the same",
     "make binary": "builds for minutes; tests/packaging/test_binary.py runs what it builds",
     "make deb": "needs what `make binary` builds; tests/ops/test_install.py makes a package",
     'make release RELEASE_OPTIONS="--python python3.11 --python python3.13'

@@ -76,11 +76,11 @@ def _lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
         f"{_size(memory['limit'])}",
     )
     yield "ROS", _ros(report["ros"])
+    yield "mDNS", _mdns(report["mdns"])
     routes = report["routes"]
     yield "routes", f"{routes['count']}, which carry {routes['bridged']} topics and calls now"
     for sick in routes["sick"]:
         yield "", f"{sick['route']}: {sick['problem']}"
-    yield "mDNS", _mdns(report["mdns"])
     for number, link in enumerate(report["upstreams"]):
         yield "" if number else "upstreams", _upstream(link)
     yield "last reload", _reload(report["reload"])

@@ -90,10 +90,10 @@ class Answers:
             or not any(each in packet for each in _WORTH_IT)
         ):
             return
-        self.size += len(packet)
-        self.is_full = self.is_full or self.size > BYTES
+        self.is_full = self.is_full or self.size + len(packet) > BYTES
         if self.is_full:
             return
+        self.size += len(packet)
         for record in DNSIncoming(packet).answers():
             self._take(record)
 

@@ -49,7 +49,7 @@ OF_A_PROTOCOL = {
 }
 
 #: These are programs of their own, or clients: they have nobody else to harm.
-PROGRAMS = ("bench/", "cli/")
+PROGRAMS = ("bench/", "cli/", "mdns/announcer.py")
 
 #: These know no loop.
 PURE = ("broker/", "mqtt/")
