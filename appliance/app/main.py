@@ -174,6 +174,9 @@ class App:
         )
         broker.router.reserved += (f"{settings.robot}/_appliance/",)
         self._entries = Entries(loop, broker.faults)
+        # Its program starts with the first announcement, which is made when all listeners are open,
+        # and says farewell while the other parts stop.
+        self._run_in_background(self._announcer.run)
         if self._crashes is not None:
             broker.faults.report = self._crashes.fault
             self._crashes.watch(loop, broker.faults)
@@ -257,7 +260,7 @@ class App:
         self._publish(state, b"online", retain=True)
         self._stack.callback(self._publish, state, b"offline", retain=True)
         self._announce()
-        self._run_in_background(self._announcer.run)
+        self._stack.callback(self._announcer.announce, "the appliance is stopping")
 
     def _open_store(self) -> SessionStore:
         wanted = self.settings.broker.store

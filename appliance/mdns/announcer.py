@@ -57,7 +57,7 @@ NAMES: Final = 9
 PATIENCE: Final = 5
 
 #: Seconds for the farewell that makes others forget the services at once.
-FAREWELL: Final = 0.6
+FAREWELL: Final = 0.5
 
 #: The most memory in bytes: what strangers send is kept for a while, up to 10,000 records.
 MEMORY: Final = 128 << 20

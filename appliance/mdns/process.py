@@ -35,7 +35,7 @@ LONGEST_DELAY: Final = 300.0
 STEADY: Final = 600.0
 
 #: Seconds in which it says farewell to the network, before it is killed.
-FAREWELL: Final = 0.9
+FAREWELL: Final = 0.6
 
 
 class AnnouncerProcess:
