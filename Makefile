@@ -40,6 +40,7 @@ run: .venv/run.stamp
 
 # Most of a test's time is waiting, so four at a time (on two cores); those that compare times come after them, alone.
 # Hundreds of processes are started: each of them compiles all its modules where that is not kept.
+# Only files with the word are imported for the marker `timed`: to import all takes longer than some of its tests.
 test: export PYTHONDONTWRITEBYTECODE =
 test:
 	@$(MAKE) --no-print-directory -j3 --output-sync checks tests-imported $(INTEROP)/node_modules
