@@ -76,7 +76,7 @@ release: .venv/release.stamp
 
 .venv/bin/pip:
 	@echo "Setting up .venv; the first time this takes a minute or two."
-	@$(PYTHON) -m venv $(VENV_OPTIONS) .venv
+	@$(PYTHON) -c 'import appliance' && $(PYTHON) -m venv $(VENV_OPTIONS) .venv
 
 .venv/run.stamp: pyproject.toml constraints.txt | .venv/bin/pip
 	@$(INSTALL) -e '.$(RUN_EXTRAS)'

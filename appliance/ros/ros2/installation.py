@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.machinery import EXTENSION_SUFFIXES
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -23,8 +24,12 @@ CHOICE = "ROS_FROM"
 DEFAULT_RMW = "rmw_fastrtps_cpp"
 
 #: rclpy's compiled module: `_rclpy_pybind11`, and in Rolling `_rclpy_nanobind`.
-_EXTENSION = re.compile(r"_rclpy_\w+\.cpython-(\d)(\d+)")
+_EXTENSION = re.compile(r"_rclpy_\w+\.cpython-(\d)(\d+)(?:-(\w+))?")
 _SITES = ("lib/python3*/site-packages", "local/lib/python3*/dist-packages")
+
+#: The kind of computer that this Python loads libraries for, as their names have it.
+_TAGS = map(re.compile(r"\.cpython-\d+-(\w+)").match, EXTENSION_SUFFIXES)
+MACHINE = next((tag[1] for tag in _TAGS if tag), "")
 
 PythonVersion = tuple[int, int]
 
@@ -32,16 +37,23 @@ PythonVersion = tuple[int, int]
 @dataclass(frozen=True)
 class Sourced:
     """A sourced ROS 2, from the environment: the Python version of its rclpy, the folder of its
-    Python packages, and its distribution where ROS_DISTRO names it."""
+    Python packages, its distribution where ROS_DISTRO names it, and the kind of computer that it
+    is for, as in MACHINE."""
 
     python: PythonVersion
     site: Path
     distribution: str
+    machine: str = MACHINE
 
     @property
     def fits(self) -> bool:
         """Whether this process can import it."""
-        return self.python == sys.version_info[:2]
+        return self.python == sys.version_info[:2] and self.is_for_this_computer
+
+    @property
+    def is_for_this_computer(self) -> bool:
+        """False for what was copied from another kind of computer."""
+        return self.machine == MACHINE
 
     def __str__(self) -> str:
         name = f"ROS 2 {self.distribution}" if self.distribution else "the ROS 2"
@@ -105,7 +117,8 @@ def find_sourced(environment: Mapping[str, str]) -> Sourced | None:
         for extension in sorted(Path(site, "rclpy").glob("_rclpy_*.so")):
             if match := _EXTENSION.match(extension.name):
                 python = int(match[1]), int(match[2])
-                found = Sourced(python, site, environment.get("ROS_DISTRO", ""))
+                distribution = environment.get("ROS_DISTRO", "")
+                found = Sourced(python, site, distribution, match[3] or MACHINE)
                 (fitting if found.fits else others).append(found)
     return next(iter([*fitting, *others]), None)
 
@@ -135,6 +148,11 @@ def is_frozen() -> bool:
 
 
 def _advice(source: str, sourced: Sourced | None, choice: str | None) -> str:
+    if sourced is not None and not sourced.is_for_this_computer:
+        return (
+            f"{sourced} is for another kind of computer: {sourced.machine}, where this is "
+            f"{MACHINE}. Install ROS on this computer, and source its setup file"
+        )
     if sourced is not None and not sourced.fits:
         python = f"python{_dotted(sourced.python)}"
         fits = (

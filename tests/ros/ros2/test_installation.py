@@ -14,14 +14,20 @@ OTHER = (3, 99)
 
 
 def source(
-    folder, python=HERE, packages=("std_msgs",), distribution="jazzy", module="_rclpy_pybind11"
+    folder,
+    python=HERE,
+    packages=("std_msgs",),
+    distribution="jazzy",
+    module="_rclpy_pybind11",
+    machine=installation.MACHINE,
 ):
     """A distribution's folder, and the environment after its setup file was sourced."""
     version = f"{python[0]}.{python[1]}"
     site = folder / f"lib/python{version}/site-packages"
     (site / "rclpy").mkdir(parents=True)
     (site / "rclpy/__init__.py").touch()
-    (site / f"rclpy/{module}.cpython-{version.replace('.', '')}-x86_64-linux-gnu.so").touch()
+    tag = f"cpython-{version.replace('.', '')}-{machine}-linux-gnu"
+    (site / f"rclpy/{module}.{tag}.so").touch()
     index = folder / "share/ament_index/resource_index/rosidl_interfaces"
     index.mkdir(parents=True)
     for package in packages:
@@ -81,6 +87,21 @@ def test_what_to_do_about_another_python(tmp_path, monkeypatch):
     assert (found.source, found.where) == ("none", None)
     assert f"cannot be used by this appliance, which has Python {HERE[0]}.{HERE[1]}" in found.advice
     assert "python3.99 -m venv --system-site-packages" in found.advice
+
+
+def test_what_to_do_about_a_ros_of_another_kind_of_computer(tmp_path, monkeypatch):
+    other = "aarch64" if installation.MACHINE == "x86_64" else "x86_64"
+    environment = source(tmp_path / "jazzy", machine=other)
+    monkeypatch.setattr(sys, "path", [environment["PYTHONPATH"]])
+    monkeypatch.setattr(installation, "find_spec", lambda name: None)
+    found = find(environment)
+    assert found.source == "none"
+    assert f"is for another kind of computer: {other}, where this is" in found.advice
+    fitting = source(tmp_path / "fitting")
+    both = {"AMENT_PREFIX_PATH": f"{tmp_path}/jazzy:{fitting['AMENT_PREFIX_PATH']}"}
+    preferred = find_sourced(both)
+    assert preferred is not None
+    assert preferred.fits
 
 
 def test_what_to_do_where_there_is_none(monkeypatch):
