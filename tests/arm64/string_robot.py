@@ -1,0 +1,12 @@
+"""A robot of ROS 1: publishes strings on /chatter and prints those that it hears on /hear."""
+
+import rospy
+from std_msgs.msg import String
+
+rospy.init_node("robot")
+publisher = rospy.Publisher("/chatter", String, queue_size=1)
+rospy.Subscriber("/hear", String, lambda message: print(message.data, flush=True))
+clock = rospy.Rate(5)
+while not rospy.is_shutdown():
+    publisher.publish("from the robot")
+    clock.sleep()
