@@ -46,7 +46,7 @@ def debian_root(path: Path, suite: str, *packages: str, architecture: str = "") 
         *("mmdebstrap", "--quiet", "--variant=extract", old, *other),
         *(f"--include={','.join(packages)}", suite, path, mirror()),
     ]
-    made = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    made = subprocess.run(command, capture_output=True, text=True, timeout=1200)
     try:
         assert made.returncode == 0, made.stderr
         yield path

@@ -7,7 +7,9 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -114,3 +116,19 @@ def messages(listener: subprocess.Popen[str]) -> list[str]:
     """What it receives until it ends, without what `-d` says of packets."""
     said = listener.communicate(timeout=2 * PATIENCE)[0].splitlines()
     return [line for line in said if not line.startswith("Client ")]
+
+
+def next_line(process: subprocess.Popen[str], again: Callable[[], object]) -> str:
+    """The next line that a node prints, while something is done again: it does not tell when it
+    has subscribed."""
+    lines: list[str] = []
+    output = process.stdout
+    assert output is not None
+    reader = threading.Thread(target=lambda: lines.append(output.readline()), daemon=True)
+    reader.start()
+    deadline = time.monotonic() + 2 * PATIENCE
+    while reader.is_alive():
+        assert time.monotonic() < deadline, f"{process.args} hears nothing"
+        again()
+        reader.join(0.2)
+    return lines[0].rstrip("\n")

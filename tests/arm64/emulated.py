@@ -49,7 +49,7 @@ class Emulated:
             *("--only-binary=:all:", "--implementation=cp", f"--python-version={PYTHON}", *glibc),
             *("--no-compile", "-c", PROJECT / "constraints.txt", *project["dependencies"]),
         ]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
         assert done.returncode == 0, done.stderr
 
     def run(self, *arguments: str | Path, code: int = 0) -> str:

@@ -24,7 +24,7 @@ import pytest
 from appliance_process import HOST, ROBOT
 from arm64.emulated import QEMU, ROS1, SUITE, Emulated
 from debian_root import debian_root, require
-from installed_appliance import START, InstalledAppliance, messages, subscribed
+from installed_appliance import START, InstalledAppliance, messages, next_line, subscribed
 from pages import PROJECT
 from waiting import PATIENCE, eventually
 
@@ -169,15 +169,9 @@ def test_strings_of_ros_1_both_ways(arm64: Emulated, tmp_path: Path) -> None:
             )
             assert json.loads(said.stdout) == {"data": "from the robot"}, house.log
 
-            heard: list[str] = []
-            assert robot.stdout is not None
-            reader = threading.Thread(target=lambda: heard.append(robot.stdout.readline()))
-            reader.start()
-            deadline = time.monotonic() + 2 * PATIENCE
-            while reader.is_alive() and time.monotonic() < deadline:
-                house.publish(f"{ROBOT}/hear", '{"data": "from MQTT"}')
-                reader.join(0.5)
-            assert heard == ["from MQTT\n"], house.log
+            told = '{"data": "from MQTT"}'
+            heard = next_line(robot, lambda: house.publish(f"{ROBOT}/hear", told))
+            assert heard == "from MQTT", house.log
         finally:
             house.stop()
 

@@ -50,6 +50,7 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         (f"_pydantic_core{SUFFIX}", b"<html>not found</html>" * 99, "is damaged"),
         (f"_pydantic_core{SUFFIX}", header(OURS), "file too short"),
     ],
+    ids=["machine", "named", "python", "empty", "page", "cut off"],
 )
 def test_a_library_that_cannot_be_loaded(
     tmp_path: Path, name: str, content: bytes, said: str

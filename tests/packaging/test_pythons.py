@@ -9,6 +9,7 @@ of others on this computer:
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -19,11 +20,27 @@ from pathlib import Path
 
 import pytest
 from appliance_process import ROBOT
-from debian_root import debian_root, inside, require
-from installed_appliance import InstalledAppliance, messages, subscribed
+from debian_root import debian_root, inside, remove, require
+from installed_appliance import START, InstalledAppliance, messages, next_line, subscribed
 from pages import PROJECT
+from ros_domain import isolated_domain
+from waiting import PATIENCE
 
-pytestmark = pytest.mark.timeout(600)
+__all__ = ["isolated_domain"]  # a fixture
+
+pytestmark = pytest.mark.timeout(1800)  # pip downloads
+
+#: What keeps its nodes apart from those of others; set by isolated_domain.
+DOMAIN = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")
+HERE = Path(__file__).parent
+ROBOT_SCRIPT = "ros2_strings.py"
+HELLO = '{"data": "from MQTT"}'
+BRIDGE = {
+    "topics": [
+        {"ros": "/chatter", "to": "mqtt"},
+        {"ros": "/hear", "to": "ros", "type": "std_msgs/msg/String"},
+    ]
+}
 
 #: Debian's releases by their Python; what is in testing fits together, and in sid at times not.
 RELEASES = {"3.13": "trixie", "3.14": "forky"}
@@ -33,6 +50,8 @@ OTHERS = [path for path in os.environ.get("APPLIANCE_PYTHONS", "").split(os.path
 PACKAGES = ("base-files", "python3-venv")
 #: What configuring the package of certificates would write.
 CERTIFICATES = "etc/ssl/certs/ca-certificates.crt"
+#: Whether ROS 2 from PyPI is tried, too: a minute more.
+WITH_ROS = os.environ.get("APPLIANCE_PYTHONS_ROS") == "1"
 PIP = ("pip", "install", "--quiet", "--only-binary=:all:", "--no-cache-dir")
 
 
@@ -43,6 +62,7 @@ class Place:
     root: Path | None
     folder: Path
     name: str
+    python: str
     environment: dict[str, str]
 
     def command(self, *command: str) -> list[str]:
@@ -54,7 +74,7 @@ class Place:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=600,
+            timeout=1200,
         )
         assert done.returncode == 0, done.stdout
         return done.stdout
@@ -74,13 +94,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(params=[*RELEASES, *OTHERS])
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Place]:
+def place(request: pytest.FixtureRequest, tmp_path: Path, isolated_domain: None) -> Iterator[Place]:
     if request.param not in RELEASES:
-        yield Place(None, tmp_path, str(tmp_path), {})
+        yield Place(None, tmp_path, str(tmp_path), request.param, dict(os.environ))
         return
     require(("mmdebstrap", "mmdebstrap"), ("mosquitto_sub", "mosquitto-clients"))
     with debian_root(tmp_path / "root", RELEASES[request.param], *PACKAGES) as root:
-        yield Place(root, root / "tmp", "/tmp", {"PATH": "/usr/bin:/bin", **network(root)})
+        ros = {name: os.environ[name] for name in DOMAIN}
+        environment = {"PATH": "/usr/bin:/bin", "HOME": "/tmp", **network(root), **ros}
+        yield Place(root, root / "tmp", "/tmp", f"/usr/bin/python{request.param}", environment)
 
 
 def network(root: Path) -> dict[str, str]:
@@ -101,34 +123,75 @@ def network(root: Path) -> dict[str, str]:
     return {f"PIP_{key.upper()}".replace("-", "_"): value for key, value in environment.items()}
 
 
-def test_the_wheel_is_installed_and_used(place: Place, wheel: Path, request) -> None:
-    asked = request.node.callspec.params["place"]
-    python = "/usr/bin/python3" if place.root else asked
-    for file in (wheel, PROJECT / "constraints.txt"):
+def test_the_wheel_is_installed_and_used(place: Place, wheel: Path) -> None:
+    for file in (wheel, PROJECT / "constraints.txt", HERE / ROBOT_SCRIPT):
         shutil.copy(file, place.folder)
-    venv = f"{place.name}/venv"
-    place.run(python, "-m", "venv", venv)
-    given = ("-c", f"{place.name}/constraints.txt", f"{place.name}/{wheel.name}")
-    place.run(f"{venv}/bin/python", "-m", *PIP, *given)
-    version = place.run(f"{venv}/bin/python", "-c", "import sys; print(*sys.version_info[:2])")
-    if place.root:
-        assert version.split() == asked.split(".")
-    appliance = InstalledAppliance(
+    place.run(place.python, "-m", "venv", f"{place.name}/venv")
+    install(place, wheel)
+    house = InstalledAppliance(
         place.folder / "house",
-        place.command(f"{venv}/bin/appliance"),
-        {"topics": [{"ros": "/chatter", "to": "mqtt"}]},
+        place.command(f"{place.name}/venv/bin/appliance"),
+        BRIDGE,
         inside=f"{place.name}/house",
     )
-    assert appliance.call("--version").startswith("appliance 0.")
-    assert "there is no ROS 2 here" in appliance.call("check", "-c", appliance.config)
-    appliance.start()
+    assert house.call("--version").startswith("appliance 0.")
+    assert "there is no ROS 2 here" in house.call("check", "-c", house.config)
+    house.start()
     try:
-        topic = f"{ROBOT}/smoke"
         for version in ("311", "5"):
             options = ("-V", version, "-q", "1")
-            listener = appliance.mosquitto("sub", "-t", topic, *options, "-C", "1")
+            listener = house.mosquitto("sub", "-t", f"{ROBOT}/smoke", *options, "-C", "1")
             with subscribed(listener) as process:
-                appliance.publish(topic, f"over TLS with {version}", *options)
+                house.publish(f"{ROBOT}/smoke", f"over TLS with {version}", *options)
                 assert messages(process) == [f"over TLS with {version}"]
     finally:
-        appliance.stop()  # by SIGTERM, upon which it ends with 0
+        house.stop()  # by SIGTERM, upon which it ends with 0
+    if WITH_ROS:
+        install(place, wheel, "[ros]")
+        check_ros_2(place, house)
+
+
+def install(place: Place, wheel: Path, extras: str = "") -> None:
+    given = ("-c", f"{place.name}/constraints.txt", f"{place.name}/{wheel.name}{extras}")
+    place.run(f"{place.name}/venv/bin/python", "-m", *PIP, *given)
+
+
+def check_ros_2(place: Place, house: InstalledAppliance) -> None:
+    """Strings both ways, between MQTT and a node in a process of its own."""
+    house.start()
+    house.wait_for_log("on ROS as /appliance", timeout=START)
+    node = subprocess.Popen(
+        place.command(f"{place.name}/venv/bin/python", f"{place.name}/{ROBOT_SCRIPT}"),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        listener = house.mosquitto("sub", "-t", f"{ROBOT}/chatter", "-C", "1", "-W", "100")
+        said = subprocess.run(listener, stdout=subprocess.PIPE, text=True, timeout=2 * PATIENCE)
+        assert json.loads(said.stdout) == {"data": "from the robot"}, house.log
+        heard = next_line(node, lambda: house.publish(f"{ROBOT}/hear", HELLO))
+        assert heard == "from MQTT", house.log
+    finally:
+        node.kill()
+        node.communicate()
+        house.stop()
+
+
+def test_a_root_with_a_mount_in_it_is_not_removed(tmp_path: Path) -> None:
+    """What is mounted would be emptied with it, and that may be this computer's own /dev."""
+    require()
+    root = tmp_path / "root"
+    (root / "dev").mkdir(parents=True)
+    mount = 'mount -t tmpfs none "$0/dev" && touch "$0/dev/null" && "$@"; ls "$0/dev"'
+    program = "import debian_root, pathlib, sys; debian_root.remove(pathlib.Path(sys.argv[1]))"
+    own = ("unshare", "--mount", "--propagation", "private", "sh", "-c", mount, root)
+    done = subprocess.run(
+        [*own, sys.executable, "-c", program, root],
+        env={**os.environ, "PYTHONPATH": str(PROJECT / "tests")},
+        capture_output=True,
+        text=True,
+    )
+    assert "is mounted in" in done.stderr
+    assert done.stdout == "null\n"
+    remove(root)
+    assert not root.exists()
