@@ -106,7 +106,7 @@ class LoginThrottle:
         excess = self._level(failures, now) - self._allowed
         if excess < 0:
             return 0.0
-        return min(LONGEST_DELAY, FIRST_DELAY * math.exp2(min(excess, 16)))
+        return min(LONGEST_DELAY, FIRST_DELAY * math.pow(2, min(excess, 16)))
 
     def _key_of(self, username: str) -> bytes:
         # A keyed hash: strangers' names can be long, or crafted to collide.

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from datetime import datetime, timezone
-from typing import Literal, TextIO
+from typing import TYPE_CHECKING, Literal, TextIO
 
 from appliance.config import Level
 
@@ -55,7 +55,13 @@ def setup(
         logging.getLogger(name).setLevel(own.upper())
 
 
-class _Handler(logging.StreamHandler[TextIO]):
+if TYPE_CHECKING:
+    _StreamHandler = logging.StreamHandler[TextIO]
+else:  # Python 3.10 takes no type there
+    _StreamHandler = logging.StreamHandler
+
+
+class _Handler(_StreamHandler):
     def format(self, record: logging.LogRecord) -> str:
         line = super().format(record)
         recent.append(line[:_LONGEST_RECENT])

@@ -1,7 +1,8 @@
 """The wheel, as pip installs it for each Python, and a first use of it.
 
-Python 3.13 and 3.14 are Debian's, in roots of their own. `APPLIANCE_PYTHONS` names the executables
-of others on this computer:
+Python 3.13 and 3.14 are Debian's, in roots of their own; 3.10, the oldest, is this computer's if it
+has one. `APPLIANCE_PYTHONS` names the executables of others, and `APPLIANCE_PYTHONS_ROS=1` has all
+of them tried with ROS 2 from PyPI, too:
 
     APPLIANCE_PYTHONS=/opt/python3.10/bin/python3:/opt/python3.12/bin/python3 \\
         pytest tests/packaging/test_pythons.py
@@ -33,7 +34,7 @@ pytestmark = pytest.mark.timeout(1800)  # pip downloads
 #: What keeps its nodes apart from those of others; set by isolated_domain.
 DOMAIN = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")
 HERE = Path(__file__).parent
-ROBOT_SCRIPT = "ros2_strings.py"
+ROBOT_SCRIPT, IMPORTS = "ros2_strings.py", "import_all.py"
 HELLO = '{"data": "from MQTT"}'
 BRIDGE = {
     "topics": [
@@ -44,7 +45,19 @@ BRIDGE = {
 
 #: Debian's releases by their Python; what is in testing fits together, and in sid at times not.
 RELEASES = {"3.13": "trixie", "3.14": "forky"}
-OTHERS = [path for path in os.environ.get("APPLIANCE_PYTHONS", "").split(os.pathsep) if path]
+OLDEST = "3.10"
+
+
+def others() -> list[str]:
+    """The executables of other Pythons, the oldest first: this computer's, or one of pyenv's."""
+    given = [path for path in os.environ.get("APPLIANCE_PYTHONS", "").split(os.pathsep) if path]
+    pyenv = Path.home().glob(f".pyenv/versions/{OLDEST}.*/bin/python3")
+    for path in (shutil.which(f"python{OLDEST}"), *map(str, sorted(pyenv))):
+        # A shim of pyenv may be there without its Python.
+        if path and subprocess.run([path, "--version"], capture_output=True).returncode == 0:
+            return [path, *given]
+    return given
+
 
 #: base-files has the links of the root, such as /lib64.
 PACKAGES = ("base-files", "python3-venv")
@@ -52,7 +65,7 @@ PACKAGES = ("base-files", "python3-venv")
 CERTIFICATES = "etc/ssl/certs/ca-certificates.crt"
 #: Whether ROS 2 from PyPI is tried, too: a minute more.
 WITH_ROS = os.environ.get("APPLIANCE_PYTHONS_ROS") == "1"
-PIP = ("pip", "install", "--quiet", "--only-binary=:all:", "--no-cache-dir")
+PIP = ("pip", "install", "--quiet", "--no-cache-dir")
 
 
 @dataclass
@@ -93,7 +106,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-@pytest.fixture(params=[*RELEASES, *OTHERS])
+@pytest.fixture(params=[*RELEASES, *others()])
 def place(request: pytest.FixtureRequest, tmp_path: Path, isolated_domain: None) -> Iterator[Place]:
     if request.param not in RELEASES:
         yield Place(None, tmp_path, str(tmp_path), request.param, dict(os.environ))
@@ -124,7 +137,7 @@ def network(root: Path) -> dict[str, str]:
 
 
 def test_the_wheel_is_installed_and_used(place: Place, wheel: Path) -> None:
-    for file in (wheel, PROJECT / "constraints.txt", HERE / ROBOT_SCRIPT):
+    for file in (wheel, PROJECT / "constraints.txt", HERE / ROBOT_SCRIPT, HERE / IMPORTS):
         shutil.copy(file, place.folder)
     place.run(place.python, "-m", "venv", f"{place.name}/venv")
     install(place, wheel)
@@ -134,6 +147,7 @@ def test_the_wheel_is_installed_and_used(place: Place, wheel: Path) -> None:
         BRIDGE,
         inside=f"{place.name}/house",
     )
+    assert place.run(f"{place.name}/venv/bin/python", f"{place.name}/{IMPORTS}") == ""
     assert house.call("--version").startswith("appliance 0.")
     assert "there is no ROS 2 here" in house.call("check", "-c", house.config)
     house.start()
@@ -152,7 +166,9 @@ def test_the_wheel_is_installed_and_used(place: Place, wheel: Path) -> None:
 
 
 def install(place: Place, wheel: Path, extras: str = "") -> None:
-    given = ("-c", f"{place.name}/constraints.txt", f"{place.name}/{wheel.name}{extras}")
+    given = ["-c", f"{place.name}/constraints.txt", f"{place.name}/{wheel.name}{extras}"]
+    if not extras:  # ROS 2 needs packages that have no wheels
+        given.append("--only-binary=:all:")
     place.run(f"{place.name}/venv/bin/python", "-m", *PIP, *given)
 
 
