@@ -24,6 +24,7 @@ from appliance.config import parse_size
 from appliance.ops.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
 from appliance.ops.unit import ENVIRONMENT, VARIABLES, Unit
 from appliance.packaging import completion, manual
+from appliance.packaging.symbols import UnreadableError, examine
 from appliance.ros.ros2 import fastdds
 
 PACKAGE = "appliance"
@@ -57,7 +58,8 @@ def build(command: Path, directory: Path) -> Path:
             _write(root, Path("/DEBIAN", script), (SCRIPTS / script).read_text(), 0o755)
         _write(root, OVERRIDES, (SCRIPTS / "lintian-overrides").read_text())
         _write(root, Path("/DEBIAN/conffiles"), f"{ENVIRONMENT}\n")
-        _write(root, Path("/DEBIAN/control"), _control(root, release, architecture))
+        libc = examine(command).least_glibc()
+        _write(root, Path("/DEBIAN/control"), _control(root, release, architecture, libc))
         directory.mkdir(exist_ok=True)
         package = directory / f"{PACKAGE}_{release}_{architecture}.deb"
         # The executable is compressed already: fast gzip is enough.
@@ -113,10 +115,8 @@ def _reference(root: Path, release: str) -> None:
     _write(root, Path("/usr/share", PACKAGE, "fastdds.xml"), profile)
 
 
-def _control(root: Path, release: str, architecture: str) -> str:
+def _control(root: Path, release: str, architecture: str, libc: str) -> str:
     size = sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) // 1024
-    # An executable linked on this computer needs its version of the C library or a later one.
-    libc = _output_of("getconf", "GNU_LIBC_VERSION").split()[-1]
     return (
         f"Package: {PACKAGE}\nVersion: {release}\nArchitecture: {architecture}\n"
         f"Maintainer: {_maintainer()}\nInstalled-Size: {size}\n"
@@ -134,6 +134,8 @@ def _maintainer() -> str:
 def _moment() -> float:
     """The time of the newest commit, so that the same sources give the same package."""
     try:
+        if given := os.environ.get("SOURCE_DATE_EPOCH"):
+            return float(given)
         return float(_output_of("git", "-C", str(PROJECT), "log", "-1", "--format=%ct"))
     except (OSError, ValueError, subprocess.CalledProcessError):
         return (PROJECT / "CHANGELOG.md").stat().st_mtime
@@ -163,7 +165,10 @@ def main() -> int:
     if not options.command.is_file():
         parser.error(f"there is no {options.command}: `make binary` makes it")
     os.umask(0o022)
-    print(build(options.command, options.directory))
+    try:
+        print(build(options.command, options.directory))
+    except UnreadableError as error:
+        parser.error(str(error))
     return 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 import shlex
 import stat
 import subprocess
@@ -20,6 +21,7 @@ from appliance.config import load
 from appliance.ops.init import Credentials
 from appliance.ops.install import InstallError, ServiceInstaller
 from appliance.ops.unit import Unit
+from appliance.packaging.symbols import examine
 
 PROJECT = Path(__file__).resolve().parent.parent.parent
 COMMAND = Path("usr/local/bin/appliance")
@@ -502,12 +504,13 @@ def test_systemd_understands_the_unit(tmp_path: Path, user: str) -> None:
 
 
 def test_the_debian_package(tmp_path: Path) -> None:
+    program = Path(shutil.which("true") or "")
     built = subprocess.run(
         [
             sys.executable,
             "-m",
             "appliance.packaging.deb",
-            single_file(tmp_path),
+            program,
             "--directory",
             tmp_path,
         ],
@@ -520,6 +523,8 @@ def test_the_debian_package(tmp_path: Path) -> None:
     assert re.fullmatch(r"appliance_[\w.~]+_\w+\.deb", package.name)
     subprocess.run(["dpkg-deb", "--raw-extract", package, tmp_path / "raw"], check=True)
     raw = tmp_path / "raw"
+    least = examine(program).least_glibc()
+    assert f"Depends: libc6 (>= {least})," in (raw / "DEBIAN/control").read_text()
     files = {str(path.relative_to(raw)) for path in raw.rglob("*") if path.is_file()}
     assert {"usr/bin/appliance", "usr/lib/systemd/system/appliance.service"} <= files
     assert not [name for name in files if name.startswith("etc/appliance") or ".key" in name]
