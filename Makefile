@@ -4,7 +4,8 @@
 # make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
 #                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
 # make binary    dist/appliance: one executable with everything in it, for this kind of computer;
-#                needs binutils and Python's shared library (apt install binutils libpython3-dev)
+#                needs binutils and Python's shared library (apt install binutils libpython3-dev);
+#                with the broker as machine code: make binary COMPILE=1, or make deb COMPILE=1
 # make deb   dist/appliance_VERSION_ARCHITECTURE.deb of what `make binary` makes, with its service
 # make release   all that a release publishes, in dist/: docs/release.md says what, and what it needs
 # What they install goes to .venv, what they make to run; both can be deleted at any time.
@@ -64,9 +65,20 @@ test-kilted: $(KILTED)/test.stamp
 compiled: .venv/run.stamp
 	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
 
+ifeq ($(COMPILE),1)
+binary: build/compiled
+BINARY_OPTIONS := -- --compiled build/compiled
+endif
 binary: .venv/binary.stamp
-	$(BIN)/pyinstaller --noconfirm --log-level WARN --workpath build --distpath dist appliance/packaging/appliance.spec
+	$(BIN)/pyinstaller --noconfirm --log-level WARN --workpath build --distpath dist appliance/packaging/appliance.spec $(BINARY_OPTIONS)
 	@ls -sh dist/appliance
+
+# Anew each time: of what setuptools has left there it would also take what is no longer compiled.
+.PHONY: build/compiled
+build/compiled: .venv/binary.stamp
+	@rm -rf build/lib.* build/bdist.* build/wheel $@
+	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w build/wheel .
+	@$(BIN)/python -m zipfile -e build/wheel/*.whl $@
 
 deb: binary
 	@$(BIN)/python -m appliance.packaging.deb dist/appliance

@@ -47,10 +47,15 @@ NOT_RUN = {
     "appliance find": "asks the computer's own network; tests/mdns does it in networks of its own",
     "appliance find --ca ca.crt": "the same",
     "make binary": "builds for minutes; tests/packaging/test_binary.py runs what it builds",
+    "make deb COMPILE=1": "compiles for minutes; tests/packaging has the parts",
+    "sudo apt install mmdebstrap bubblewrap debian-archive-keyring": "changes the system",
+    "sudo .venv/bin/python -m appliance.packaging.root --out dist": "builds a Python and needs a"
+    " network; tests/packaging/test_root.py has what it refuses and keeps",
     "make deb": "needs what `make binary` builds; tests/ops/test_install.py makes a package",
     'make release RELEASE_OPTIONS="--python python3.11 --python python3.13'
     ' --machine x86_64"': "builds for half an hour; tests/packaging has its parts",
     "apt install git gcc python3-dev python3-venv lintian": "changes the system",
+    "apt install mmdebstrap bubblewrap debian-archive-keyring": "changes the system",
     "apt install gcc-aarch64-linux-gnu": "changes the system",
     'git tag --annotate v1.2.3 --message "Version 1.2.3"': "makes a release of this repository",
     "git push origin v1.2.3": "needs another computer",

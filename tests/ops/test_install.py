@@ -5,8 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import re
-import shutil
 import shlex
+import shutil
 import stat
 import subprocess
 import sys

@@ -30,6 +30,15 @@ from appliance.upstream import backlog
 print(client, tls, backlog)
 """
 
+#: The same after the entry point of the one file, whose unpacked files are in the argument.
+IN_ONE_FILE = f"""
+import sys
+from appliance.packaging import entry
+entry.INSIDE = sys.argv[1]
+entry.use_machine_code()
+{WHERE}
+"""
+
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -85,3 +94,26 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
     assert run.returncode == 0, run.stdout[-4000:]
     passed = re.search(r"^(\d+) passed", run.stdout, re.MULTILINE)
     assert passed and int(passed[1]) > 1000, run.stdout[-1000:]
+
+
+def test_the_one_file_has_the_pure_modules_behind_the_compiled(compiled: Path, tmp_path: Path):
+    def where(unpacked: Path, **environment: str) -> tuple[str, str]:
+        done = subprocess.run(
+            [sys.executable, "-c", IN_ONE_FILE, unpacked],
+            env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+            cwd=tmp_path,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        return done.stdout, done.stderr
+
+    assert where(compiled)[0].count(f"{compiled}/appliance/") == 3
+    pure = f"{ROOT}/appliance/"
+    assert where(compiled, APPLIANCE_PURE="1")[0].count(pure) == 3
+    assert where(tmp_path) == (where(compiled, APPLIANCE_PURE="1")[0], ""), "none is in the file"
+    (library,) = compiled.glob("appliance__mypyc.*")
+    (tmp_path / library.name).write_bytes(b"no library" * 1000)
+    found, warned = where(tmp_path)
+    assert found.count(pure) == 3
+    assert warned.startswith("appliance: running without its machine code, which does not load: ")
