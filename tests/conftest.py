@@ -84,6 +84,7 @@ LONG = (
     "test_managing.py",
     "test_containment.py",
     "test_page_commands.py",
+    "test_image.py",
     "test_bench.py",
     "test_loop_subscription.py",
     "test_binary.py",

@@ -66,14 +66,19 @@ NOT_RUN = {
     " && ~/appliance/bin/pip install .": "needs Python 3.12 and a network",
     "apt install python3-rospy python3-diagnostic-msgs python3-geometry-msgs": "changes the system"
     " and needs a network; .ci/run installs these packages",
+    "cd ~/ros2_ws/src/ros-mqtt-appliance": "is for the next line",
+    "python3 -m venv --system-site-packages ~/appliance"
+    " && ~/appliance/bin/pip install .": "needs a sourced ROS and a network",
+    "cd ~/ros2_ws && rosdep install --from-paths src --ignore-src -y": "changes the system",
     "/usr/bin/python3 -m venv --system-site-packages ~/appliance/venv": "is for the next line",
     "~/appliance/venv/bin/pip install .": "needs a network",
 }
 
 #: Programs of which no line is run, and why.
 NO_PROGRAMS = {
-    "docker": "needs a Docker engine; tests/container runs the image with podman",
-    "podman": "is run by tests/container, in namespaces of its own",
+    "docker": "needs an engine; tests/container runs the image with podman",
+    "colcon": "needs a workspace; tests/packaging/test_ros_package.py makes one and builds in it",
+    "ros2": "is not to be had without a distribution of ROS",
 }
 
 #: What a line says, and what stands for it here; {port}, {user} and {password} are the appliance's.

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from appliance import certs, config
 from appliance.access import Acl, Passwords, check_username
+from appliance.certs.addresses import DNS_NAME
 from appliance.config import ConfigError
 from appliance.config.settings import Vda5050Section
 from appliance.host.environment import of_service
@@ -230,6 +231,9 @@ def initialise(
         check_username(user)
     except ValueError as error:
         raise InitError(str(error)) from None
+    for each in names:
+        if not DNS_NAME.fullmatch(each):
+            raise InitError(f"--name {each!r} is not a DNS name, such as robot.example.com")
     if manufacturer is not None and upstream is None:
         raise InitError("--vda5050 needs --upstream: the URL of the fleet's broker")
     try:

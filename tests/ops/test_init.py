@@ -292,6 +292,10 @@ def test_a_service_has_its_socket_elsewhere(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be(tmp_path: Path) -> None:
+    for name in ("*", "*.example", "robot_at home", "", "-x"):
+        with pytest.raises(InitError, match="not a DNS name"):
+            list(initialise(tmp_path, names=["robot.example", name]))
+    assert not list(tmp_path.iterdir())
     with pytest.raises(InitError, match="user name"):
         list(initialise(tmp_path, user="a:b"))
     assert list(tmp_path.iterdir()) == []
