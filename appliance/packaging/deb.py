@@ -120,7 +120,7 @@ def _control(root: Path, release: str, architecture: str, libc: str) -> str:
     return (
         f"Package: {PACKAGE}\nVersion: {release}\nArchitecture: {architecture}\n"
         f"Maintainer: {_maintainer()}\nInstalled-Size: {size}\n"
-        f"Depends: libc6 (>= {libc}), passwd, init-system-helpers (>= 1.54)\n"
+        f"Depends: libc6 (>= {libc}), zlib1g, passwd, init-system-helpers (>= 1.54)\n"
         "Recommends: systemd\nSection: net\nPriority: optional\n"
         f"Description: MQTT broker of a robot, with the bridge to ROS\n{DESCRIPTION}\n"
     )

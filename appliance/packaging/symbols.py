@@ -61,7 +61,7 @@ class Examined:
 
     def faults(self, floor: Version = FLOOR) -> Iterator[str]:
         """What would not load on a computer that has this glibc and nothing else."""
-        inside = {Path(name).name for name in self.needs}
+        inside = {Path(name.rpartition(": ")[2]).name for name in self.needs}
         for name, each in self.needs.items():
             for version, symbols in sorted(each.versions.items()):
                 number = _number(version)

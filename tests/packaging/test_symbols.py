@@ -43,7 +43,7 @@ def library(tmp_path: Path) -> Library:
 def one_file(directory: Path, *libraries: Path) -> Path:
     """As PyInstaller makes it: a program, and in a section of it the libraries."""
     archive, program = directory / "archive", directory / "appliance"
-    entries = [(f"inside/{each.name}", str(each), True, "b") for each in libraries]
+    entries = [(each.name, str(each), True, "b") for each in libraries]
     CArchiveWriter(str(archive), entries, "libpython3.11.so.1.0")
     shutil.copy(examined_program(directory), program)
     subprocess.run(["objcopy", "--add-section", f"pydata={archive}", program], check=True)
@@ -105,9 +105,9 @@ def test_libraries_within_the_one_file_and_its_package(library: Library, tmp_pat
     harmless, late = library("libgood.so.1"), library("liblate.so.1", "GLIBC_2.36")
     made = one_file(tmp_path, harmless, late)
     (fault,) = examine(made).faults()
-    assert fault.startswith("appliance: inside/liblate.so.1 needs GLIBC_2.36 (later)")
+    assert fault.startswith("appliance: liblate.so.1 needs GLIBC_2.36 (later)")
     (fault,) = examine(package(tmp_path, made)).faults()
-    assert "usr/bin/appliance: inside/liblate.so.1 needs GLIBC_2.36 (later)" in fault
+    assert "usr/bin/appliance: liblate.so.1 needs GLIBC_2.36 (later)" in fault
 
 
 def test_what_is_cut_off(library: Library, tmp_path: Path) -> None:
