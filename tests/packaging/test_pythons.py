@@ -27,6 +27,8 @@ from pages import PROJECT
 from ros_domain import isolated_domain
 from waiting import PATIENCE
 
+from appliance.host.environment import for_other_programs
+
 __all__ = ["isolated_domain"]  # a fixture
 
 pytestmark = pytest.mark.timeout(1800)  # pip downloads
@@ -59,8 +61,9 @@ def others() -> list[str]:
     return given
 
 
-#: base-files has the links of the root, such as /lib64.
-PACKAGES = ("base-files", "python3-venv")
+#: base-files has the links of the root, such as /lib64; libstdc++6, which ROS 2 needs, is in every
+#: installed Debian.
+PACKAGES = ("base-files", "libstdc++6", "python3-venv")
 #: What configuring the package of certificates would write.
 CERTIFICATES = "etc/ssl/certs/ca-certificates.crt"
 #: Whether ROS 2 from PyPI is tried, too: a minute more.
@@ -79,7 +82,10 @@ class Place:
     environment: dict[str, str]
 
     def command(self, *command: str) -> list[str]:
-        return inside(self.root, *command, **self.environment) if self.root else [*command]
+        if self.root:
+            return inside(self.root, *command, **self.environment)
+        given = (f"{name}={value}" for name, value in self.environment.items())
+        return ["env", "-i", *given, *command]
 
     def run(self, *command: str) -> str:
         done = subprocess.run(
@@ -109,7 +115,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(params=[*RELEASES, *others()])
 def place(request: pytest.FixtureRequest, tmp_path: Path, isolated_domain: None) -> Iterator[Place]:
     if request.param not in RELEASES:
-        yield Place(None, tmp_path, str(tmp_path), request.param, dict(os.environ))
+        yield Place(None, tmp_path, str(tmp_path), request.param, for_other_programs())
         return
     require(("mmdebstrap", "mmdebstrap"), ("mosquitto_sub", "mosquitto-clients"))
     with debian_root(tmp_path / "root", RELEASES[request.param], *PACKAGES) as root:
@@ -175,21 +181,20 @@ def install(place: Place, wheel: Path, extras: str = "") -> None:
 def check_ros_2(place: Place, house: InstalledAppliance) -> None:
     """Strings both ways, between MQTT and a node in a process of its own."""
     house.start()
-    house.wait_for_log("on ROS as /appliance", timeout=START)
-    node = subprocess.Popen(
-        place.command(f"{place.name}/venv/bin/python", f"{place.name}/{ROBOT_SCRIPT}"),
-        stdout=subprocess.PIPE,
-        text=True,
-    )
     try:
-        listener = house.mosquitto("sub", "-t", f"{ROBOT}/chatter", "-C", "1", "-W", "100")
-        said = subprocess.run(listener, stdout=subprocess.PIPE, text=True, timeout=2 * PATIENCE)
-        assert json.loads(said.stdout) == {"data": "from the robot"}, house.log
-        heard = next_line(node, lambda: house.publish(f"{ROBOT}/hear", HELLO))
-        assert heard == "from MQTT", house.log
+        house.wait_for_log("on ROS as /appliance", timeout=START)
+        script = (f"{place.name}/venv/bin/python", f"{place.name}/{ROBOT_SCRIPT}")
+        node = subprocess.Popen(place.command(*script), stdout=subprocess.PIPE, text=True)
+        try:
+            listener = house.mosquitto("sub", "-t", f"{ROBOT}/chatter", "-C", "1", "-W", "100")
+            said = subprocess.run(listener, stdout=subprocess.PIPE, text=True, timeout=2 * PATIENCE)
+            assert json.loads(said.stdout) == {"data": "from the robot"}, house.log
+            heard = next_line(node, lambda: house.publish(f"{ROBOT}/hear", HELLO))
+            assert heard == "from MQTT", house.log
+        finally:
+            node.kill()
+            node.communicate()
     finally:
-        node.kill()
-        node.communicate()
         house.stop()
 
 
