@@ -186,7 +186,8 @@ class Release:
         self._checked(*lintian, *self.out.glob("*.deb"))
 
     def _checked(self, *command: str | Path) -> None:
-        told = self._run(*command, cwd=self._work).strip() or "nothing against it"
+        told = re.sub(r"\x1b\[[\d;]*m", "", self._run(*command, cwd=self._work)).strip()
+        told = told or "nothing against it"
         name = Path(command[2] if command[0] == sys.executable else command[0]).name
         self._say(f"{name}: {told.splitlines()[-1].replace(f'{self.out}/', '')}")
 
@@ -215,7 +216,7 @@ class Release:
 
     def _run(self, *command: str | Path, cwd: Path, **variables: str) -> str:
         """Run it, with all that it says in the log; returns its standard output."""
-        environment = {**os.environ, **variables, "NO_COLOR": "1"}
+        environment = {**os.environ, **variables}
         environment["PATH"] = f"{Path(sys.executable).parent}:{environment['PATH']}"
         environment.setdefault("SOURCE_DATE_EPOCH", self._moment())
         with self._log.open("a") as log:

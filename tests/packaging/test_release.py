@@ -121,7 +121,7 @@ def test_a_command_that_fails_is_shown_with_its_last_lines(made: release.Release
 def test_a_check_that_finds_something_ends_the_release(
     made: release.Release, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made._checked("echo", f"{made.out}/x.whl: OK")
+    made._checked("echo", f"{made.out}/x.whl: \x1b[32mOK\x1b[0m")
     assert capsys.readouterr().out.strip() == "echo: x.whl: OK"
     made._checked("true")
     assert capsys.readouterr().out.strip() == "true: nothing against it"
