@@ -326,6 +326,7 @@ def main() -> None:
     # What it logs is about what strangers send.
     logging.getLogger("zeroconf").setLevel(logging.CRITICAL)
     asyncio.run(_run())
+    os._exit(0)  # what Python does at its end takes seconds with this priority on a busy computer
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from waiting import PATIENCE, eventually
 
 from appliance import certs
 from appliance.mdns.announcer import NAMES
+from appliance.ops.control import ask
+from appliance.ops.init import initialise
 
 APPLIANCE = (sys.executable, "-m", "appliance")
 
@@ -56,8 +58,9 @@ class Robot:
         self.computer = computer
         self.folder = folder
         self.ca = folder / "certs/ca.crt"
-        self._say("init", "--dir", folder, "--robot", robot)
+        list(initialise(folder, robot=robot))
         self._file = folder / "appliance.yaml"
+        self._control = folder / "state/control.sock"
         self.change("bridge:\n", "bridge:\n  bus: none\n")
         self.process = computer.start(
             *(*APPLIANCE, "run", "-c", self._file),
@@ -66,41 +69,29 @@ class Robot:
             stderr=subprocess.STDOUT,
         )
 
-    def _say(self, *arguments: str | Path) -> str:
-        done = subprocess.run(
-            self.computer.command(*APPLIANCE, *arguments),
-            capture_output=True,
-            text=True,
-            env=environment(),
-            timeout=PATIENCE,
-        )
-        assert done.returncode == 0, done
-        return done.stdout
-
     def change(self, old: str, new: str) -> None:
         text = self._file.read_text()
         assert old in text
         self._file.write_text(text.replace(old, new, 1))
 
     def reload(self) -> None:
-        self._say("reload", "-c", self._file)
+        ask(self._control, "reload")
 
     def status(self) -> dict[str, Any]:
-        told: dict[str, Any] = json.loads(self._say("status", "--json", "-c", self._file))
+        """What it tells about the announcing."""
+        told: dict[str, Any] = ask(self._control, "status")["mdns"]
         return told
 
     @property
     def name(self) -> str:
         """The name that it is announced by; empty while it is not."""
-        if not (self.folder / "state/control.sock").exists():
-            return ""
-        return str(self.status()["mdns"]["name"] or "")
+        return str(self.status()["name"] or "") if self._control.exists() else ""
 
     def announced(self, *addresses: str) -> None:
         """Wait until it says that it is announced, with these addresses."""
 
         def told() -> bool:
-            at = " ".join(self.status()["mdns"]["links"]).replace(",", "").split()
+            at = " ".join(self.status()["links"]).replace(",", "").split()
             return all(each in at for each in addresses)
 
         eventually(lambda: self.name and told(), f"it announces {addresses}")
@@ -112,7 +103,7 @@ class Robot:
 
 def find(computer: Computer, *arguments: str | Path, code: int = 0) -> list[dict[str, Any]]:
     done = subprocess.run(
-        computer.command(*APPLIANCE, "find", "--json", "--timeout", "1", *arguments),
+        computer.command(*APPLIANCE, "find", "--json", "--timeout", "0.5", *arguments),
         capture_output=True,
         text=True,
         env=environment(),
@@ -232,7 +223,7 @@ def test_a_setting_turns_it_off(judge: Computer, robot: Robot) -> None:
     child = robot.announcer()
     robot.reload()
     eventually(lambda: not child.is_running(), "the end of the announcing program")
-    assert robot.status()["mdns"]["reason"] == "broker.mdns is false"
+    assert robot.status()["reason"] == "broker.mdns is false"
     eventually(lambda: services(judge) == [], "the farewell")
     robot.change("  mdns: false\n", "")
     robot.reload()
@@ -247,16 +238,13 @@ def test_who_claims_every_name(
     running = stranger.start(sys.executable, "-c", STRANGER, stdout=subprocess.PIPE)
     assert running.stdout.readline() == b"ready\n"
     robot.announcer().send_signal(signal.SIGKILL)
-    eventually(lambda: robot.status()["mdns"]["problem"], "it says so")
+    eventually(lambda: robot.status()["problem"], "it says so")
 
     def problem() -> bool:
-        told = robot.status()["mdns"]
+        told = robot.status()
         return "claims every name" in (told["problem"] or "") and told["restarts"] == 1
 
     eventually(problem, "it goes on")
-    name = robot.status()["mdns"]["name"]
-    assert (
-        name.startswith("r2d2 appliance-")
-        and f"'r2d2 ({NAMES})'" in robot.status()["mdns"]["problem"]
-    )
+    name = robot.status()["name"]
+    assert name.startswith("r2d2 appliance-") and f"'r2d2 ({NAMES})'" in robot.status()["problem"]
     assert name in [each[0] for each in services(judge)]

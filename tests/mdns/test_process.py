@@ -127,7 +127,7 @@ async def test_one_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(announcing, "FAREWELL", 0.05)
     async with running("sleep 1000 & echo $! > child; wait") as process:
         process.announce(WANTED)
-        await until(child)
+        await until(lambda: process.pid and child())  # not while it is being started
     await until(
         lambda: not psutil.pid_exists(child()) or psutil.Process(child()).status() == "zombie"
     )
