@@ -23,6 +23,11 @@ from typing import Any
 import psutil
 from waiting import eventually
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 PROJECT = Path(__file__).parents[2]
 DOCKERFILE = PROJECT / "appliance/packaging/container/Dockerfile"
 
@@ -195,6 +200,7 @@ class Engine:
 
     def _download(self, extras: Sequence[str], more: Sequence[str]) -> None:
         what = f"{PROJECT}[{','.join(extras)}]" if extras else f"{PROJECT}"
+        project = tomllib.loads((PROJECT / "pyproject.toml").read_text())
         run(
             [
                 *(
@@ -207,7 +213,7 @@ class Engine:
                 ),
                 *("--python-version", DEBIAN_PYTHON, "--only-binary", ":all:"),
                 *("--constraint", PROJECT / "constraints.txt", "--dest", self._wheels),
-                *(what, "setuptools>=77", *more),
+                *(what, *project["build-system"]["requires"], *more),
             ],
             timeout=900,
         )

@@ -164,7 +164,7 @@ def test_a_port_that_is_taken_and_a_store_in_use(podman: Engine, container: Cont
 
 
 def test_other_commands_and_a_ros_of_the_image(podman: Engine, container: Container) -> None:
-    assert re.fullmatch(r"appliance \S+\n", podman.run("--rm", IMAGE, "--version"))
+    assert re.fullmatch(r"appliance \S+, pure Python\n", podman.run("--rm", IMAGE, "--version"))
     assert "No such command 'fly'" in podman.run("--rm", IMAGE, "fly", code=2)
     told = podman.run("--rm", "--env", "ROS_SETUP=/gone/setup.sh", IMAGE, "--version")
     assert told.startswith("appliance: ROS_SETUP cannot be read: /gone/setup.sh\nappliance ")
