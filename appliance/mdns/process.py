@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from asyncio.subprocess import PIPE, STDOUT, Process
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from typing import Any, Final
 
 from appliance.mdns.announcement import Announcement
@@ -108,8 +108,7 @@ class AnnouncerProcess:
                 delay = self._first_delay
             self._failure = f"the announcing program {why}"
             log.warning("mDNS: %s; it is started again in %g s", self._failure, delay)
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), delay)
+            await _at_most(delay, self._changed.wait())
             delay = min(2 * delay, LONGEST_DELAY)
             self.restarts += 1
 
@@ -193,14 +192,12 @@ async def _end(process: Process) -> None:
     assert process.stdin is not None
     process.stdin.close()
     try:
-        with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(_ended(process), FAREWELL)
+        await _at_most(FAREWELL, _ended(process))
     finally:
         if process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-    with contextlib.suppress(asyncio.TimeoutError):
-        await asyncio.wait_for(_ended(process), FAREWELL)
+    await _at_most(FAREWELL, _ended(process))
 
 
 async def _ended(process: Process) -> None:
@@ -209,3 +206,18 @@ async def _ended(process: Process) -> None:
     while await process.stdout.read(LINE_SIZE):
         pass
     await process.wait()
+
+
+async def _at_most(seconds: float, work: Coroutine[Any, Any, object]) -> None:
+    """Wait for the work, and end it when it takes longer.
+
+    Not by `asyncio.wait_for`: up to Python 3.11 that loses a cancellation which comes together with
+    the end of the work, and the appliance could not stop.
+    """
+    task = asyncio.create_task(work)
+    try:
+        await asyncio.wait({task}, timeout=seconds)
+    finally:
+        task.cancel()
+    if task.done() and not task.cancelled():
+        task.result()

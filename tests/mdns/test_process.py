@@ -15,7 +15,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance.mdns import process as announcing
 from appliance.mdns.announcement import SECURE_MQTT, Announcement, Service
@@ -112,6 +112,19 @@ async def test_one_that_fails_is_tried_less_and_less(
         assert process.status()["problem"] == problem
     found = [record.args for record in caplog.records if "started again" in record.msg]
     assert [args[1] for args in found if isinstance(args, tuple)][:4] == [0.01, 0.02, 0.04, 0.05]
+
+
+async def test_a_cancellation_that_comes_with_the_end_is_not_lost() -> None:
+    """The appliance stops by it, whatever the program does meanwhile."""
+    is_over = asyncio.Event()
+    waiting = asyncio.create_task(announcing._at_most(PATIENCE, is_over.wait()))
+    for _ in range(3):
+        await asyncio.sleep(0)
+    is_over.set()
+    await asyncio.sleep(0)  # now its work has ended
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
 
 
 async def test_one_that_is_not_there() -> None:
