@@ -11,21 +11,21 @@ import pytest
 LAST = 101
 
 
-def _claim() -> tuple[str, socket.socket]:
+def claim() -> tuple[str, socket.socket]:
     """A domain, and what keeps it for this process until it ends, however it does."""
     for offset in range(LAST):
         number = 1 + (os.getpid() + offset) % LAST
-        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
-            claim.bind(f"\0appliance-tests-ros-domain-{number}")
+            held.bind(f"\0appliance-tests-ros-domain-{number}")
         except OSError:  # another worker's, or another run's
-            claim.close()
+            held.close()
         else:
-            return str(number), claim
+            return str(number), held
     raise RuntimeError(f"each ROS domain from 1 to {LAST} is used by a test run on this computer")
 
 
-DOMAIN, _CLAIM = _claim()
+DOMAIN, _HELD = claim()
 
 
 @pytest.fixture

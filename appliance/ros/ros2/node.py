@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import logging
 import os
 import re
@@ -264,6 +265,9 @@ class Ros2Node(FaultContainment):
         if self._context is not None:
             self._rclpy.try_shutdown(context=self._context)
         self._executor = self._node = self._context = self._clock = None
+        # Circles of rclpy's objects keep a node with remappings on the bus, beside the next one,
+        # until they are looked for, which the appliance does not do by itself.
+        gc.collect()
 
     def call_soon(self, callback: Callable[[], None]) -> None:
         executor = self._executor

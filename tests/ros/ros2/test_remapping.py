@@ -13,12 +13,14 @@ pytest.importorskip("test_msgs.action")
 from call_harness import CallHarness, action, parameters, service
 from robot_process import Robot
 from ros2_harness import STRING, TWIST, Peer, string
+from ros_domain import claim
 
 from appliance.ros.bridge import TopicSettings
 from appliance.ros.remapping import remapped_names, with_own_names
 from appliance.ros.ros2.node import Ros2Node
 
-pytestmark = pytest.mark.usefixtures("isolated_domain")
+#: The node of a bridge with parameters is seen for a while after it has left: not by other tests.
+DOMAIN, _HELD = claim()
 
 PARAMETERS = ("describe", "get", "list", "set")
 RULES = (
@@ -43,6 +45,11 @@ TOPICS = (
     TopicSettings("/cmd", "ros", "r2d2/cmd", TWIST),
     TopicSettings(("/talk", "/elsewhere/*"), "mqtt", "r2d2{ros}", encoding="text"),
 )
+
+
+@pytest.fixture(autouse=True)
+def own_domain(isolated_domain, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", DOMAIN)
 
 
 @pytest.fixture
