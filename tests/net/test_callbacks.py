@@ -74,6 +74,8 @@ ALLOWED = {
     ("plugins/threads.py", "call_soon_threadsafe"),
     # Waited for where it is made.
     ("ros/calls/actions.py", "ensure_future"),
+    # Awaited where it is made, which raises what it raises.
+    ("mdns/process.py", "create_task"),
     # The executor's, and a Future of rclpy's: `run` contains it.
     ("ros/ros2/node.py", "create_task"),
     ("ros/ros2/node.py", "add_done_callback"),
