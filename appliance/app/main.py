@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 import uvloop
+from async_timeout import timeout
 
 from appliance.access import AccessFileError, FileAccess, LoginPolicy, TokenFile, no_user
 from appliance.access.enrolments import Enrolments
@@ -293,7 +294,7 @@ class App:
         task = self._entries.task("app.task", restart_forever())
 
         async def end() -> None:
-            while not task.done():  # up to Python 3.11, `wait_for` can lose a cancellation
+            while not task.done():  # a library can lose a cancellation
                 task.cancel()
                 await asyncio.wait({task}, timeout=1)
 
@@ -326,7 +327,8 @@ class App:
                     logged_at[text] = now
                     log.warning("%s", text)
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(due.wait(), CERTIFICATE_CHECK)
+                async with timeout(CERTIFICATE_CHECK):
+                    await due.wait()
             due.clear()
             # Clients' certificates expire, too.
             await self._listeners.check_certificates()

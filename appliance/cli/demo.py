@@ -15,6 +15,7 @@ from pathlib import Path
 
 import typer
 import uvloop
+from async_timeout import timeout
 
 from appliance.access import Passwords
 from appliance.app.main import App
@@ -125,7 +126,8 @@ async def _stop(robot: Process) -> None:
     with contextlib.suppress(ProcessLookupError):
         robot.terminate()
     try:
-        await asyncio.wait_for(robot.wait(), STOP_TIMEOUT)
+        async with timeout(STOP_TIMEOUT):
+            await robot.wait()
     except asyncio.TimeoutError:
         robot.kill()
         await robot.wait()

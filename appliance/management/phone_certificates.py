@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from async_timeout import timeout
+
 from appliance import certs
 from appliance.certs import CertificateError, packing
 from appliance.certs.settings import authority_directory
@@ -57,7 +59,8 @@ class PhoneCertificates:
         try:
             made: Any = await verbs.run(caller, SIGN, {"request": request.decode(), "name": name})
             given = packing.given(name, key, made["certificate"], made["ca"], password)
-            packed = await asyncio.wait_for(self._packed(given), PACKING)
+            async with timeout(PACKING):
+                packed = await self._packed(given)
         except CallError as error:
             raise CallError(error.code, _without(directory, str(error))) from None
         except asyncio.TimeoutError:

@@ -23,6 +23,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NoReturn
 
+from async_timeout import timeout
 from zeroconf import (  # type: ignore[attr-defined]  # the record types are there, and not exported
     DNSOutgoing,
     DNSQuestion,
@@ -150,7 +151,8 @@ class LinkAnnouncer:
         if self.rival(name):
             zeroconf.registry.async_remove(zeroconf.registry.async_get_service_infos())
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._mdns.async_unregister_all_services(), FAREWELL)
+            async with timeout(FAREWELL):
+                await self._mdns.async_unregister_all_services()
         await self._mdns.async_close()
 
 

@@ -10,8 +10,10 @@ import os
 import signal
 import sys
 from asyncio.subprocess import PIPE, STDOUT, Process
-from collections.abc import Coroutine, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
+
+from async_timeout import timeout
 
 from appliance.mdns.announcement import Announcement
 
@@ -108,7 +110,9 @@ class AnnouncerProcess:
                 delay = self._first_delay
             self._failure = f"the announcing program {why}"
             log.warning("mDNS: %s; it is started again in %g s", self._failure, delay)
-            await _at_most(delay, self._changed.wait())
+            with contextlib.suppress(asyncio.TimeoutError):
+                async with timeout(delay):
+                    await self._changed.wait()
             delay = min(2 * delay, LONGEST_DELAY)
             self.restarts += 1
 
@@ -192,32 +196,19 @@ async def _end(process: Process) -> None:
     assert process.stdin is not None
     process.stdin.close()
     try:
-        await _at_most(FAREWELL, _ended(process))
+        await _ended(process)
     finally:
         if process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-    await _at_most(FAREWELL, _ended(process))
+    await _ended(process)
 
 
 async def _ended(process: Process) -> None:
-    """Wait for its end, which is not seen before all that it has printed is read."""
+    """Wait for its end, for a while; it is not seen before all that it has printed is read."""
     assert process.stdout is not None
-    while await process.stdout.read(LINE_SIZE):
-        pass
-    await process.wait()
-
-
-async def _at_most(seconds: float, work: Coroutine[Any, Any, object]) -> None:
-    """Wait for the work, and end it when it takes longer.
-
-    Not by `asyncio.wait_for`: up to Python 3.11 that loses a cancellation which comes together with
-    the end of the work, and the appliance could not stop.
-    """
-    task = asyncio.create_task(work)
-    try:
-        await asyncio.wait({task}, timeout=seconds)
-    finally:
-        task.cancel()
-    if task.done() and not task.cancelled():
-        task.result()
+    with contextlib.suppress(asyncio.TimeoutError):
+        async with timeout(FAREWELL):
+            while await process.stdout.read(LINE_SIZE):
+                pass
+            await process.wait()

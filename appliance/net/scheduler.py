@@ -17,6 +17,8 @@ from collections.abc import Awaitable, Callable, Coroutine
 from functools import partial
 from typing import Protocol, TypeAlias
 
+from async_timeout import timeout
+
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
 from appliance.broker.limits import Anonymous
@@ -359,8 +361,8 @@ class Scheduler:
         if self._all_closed is not None and not self.connections and not self._lingering:
             self._all_closed.set()
 
-    async def close(self, timeout: float) -> None:
-        """Close all connections; abort those that are not read to the end within `timeout`."""
+    async def close(self, patience: float) -> None:
+        """Close all connections; abort those that are not read to the end in so many seconds."""
         for member in list(self.connections):
             member.close()
         for task in list(self.tasks):
@@ -368,7 +370,8 @@ class Scheduler:
         if self.connections or self._lingering:
             self._all_closed = asyncio.Event()
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._all_closed.wait(), timeout)
+                async with timeout(patience):
+                    await self._all_closed.wait()
         for member in list(self.connections):
             member.abort()
         for lingering in list(self._lingering):

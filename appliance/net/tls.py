@@ -16,6 +16,8 @@ import ssl
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, TypeAlias, cast
 
+from async_timeout import timeout
+
 from appliance.net.callbacks import FaultHandler, contained, contained_made
 from appliance.net.layers import LayerScheduler, UpperLayer
 
@@ -170,15 +172,16 @@ class TlsTransport:
         self._error: Exception | None = None
         self._deadline: asyncio.TimerHandle | None = None
 
-    async def shake_hands(self, connection: socket.socket, timeout: float) -> Exception | None:
+    async def shake_hands(self, connection: socket.socket, patience: float) -> Exception | None:
         """Perform the handshake; returns why that failed, if it did, see `accept`."""
         protocol = cast(asyncio.Protocol, self)
         await self._loop.connect_accepted_socket(lambda: protocol, connection)
         try:
-            return await asyncio.wait_for(self._handshake, timeout)
+            async with timeout(patience):
+                return await self._handshake
         except asyncio.TimeoutError:
             self.abort()
-            return asyncio.TimeoutError(f"no handshake within {timeout:g} s")
+            return asyncio.TimeoutError(f"no handshake within {patience:g} s")
         except BaseException:
             self.abort()
             raise

@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from async_timeout import timeout
+
 from appliance.broker.faults import Faults
 from appliance.net.sockets import listen_on_path
 
@@ -74,7 +76,8 @@ class Control:
         try:
             answer = await self._answer(reader)
             writer.write(json.dumps(answer).encode() + b"\n")
-            await asyncio.wait_for(writer.drain(), REQUEST_TIMEOUT)
+            async with timeout(REQUEST_TIMEOUT):
+                await writer.drain()
         except (OSError, asyncio.TimeoutError) as error:
             log.debug("the response could not be sent: %s", error)
             writer.transport.abort()  # otherwise its rest would wait for a reader for ever
@@ -86,7 +89,8 @@ class Control:
 
     async def _answer(self, reader: asyncio.StreamReader) -> dict[str, object]:
         try:
-            line = await asyncio.wait_for(reader.readline(), REQUEST_TIMEOUT)
+            async with timeout(REQUEST_TIMEOUT):
+                line = await reader.readline()
             request = json.loads(line)
         except asyncio.TimeoutError:
             return {"error": f"no request within {REQUEST_TIMEOUT:g} s"}

@@ -6,6 +6,8 @@ import asyncio
 import logging
 from collections.abc import Callable
 
+from async_timeout import timeout
+
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.session import Session
@@ -76,7 +78,8 @@ class Pulse:
         turn = self._turn
         self._queue()
         try:
-            await asyncio.wait_for(turn.wait(), TURN_PATIENCE)
+            async with timeout(TURN_PATIENCE):
+                await turn.wait()
         except asyncio.TimeoutError:
             return _TURN
         return ""

@@ -243,8 +243,8 @@ class _Dial:
     ) -> T:
         """The result of a step; DialError when it takes too long.
 
-        The step is a task of its own: up to Python 3.11 `wait_for` may lose a cancellation, and
-        with it what was opened. A result that nobody takes is disposed of.
+        The step is a task of its own, so that what it has opened is disposed of when nobody takes
+        it: a cancellation can come together with its end.
         """
         entries = self._entries
         task = entries.task("dial.step", _outcome(work), served=str(self._server))

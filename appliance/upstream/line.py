@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Protocol
 
+from async_timeout import timeout
+
 from appliance.config.urls import ServerUrl, parse_proxy
 from appliance.mqtt.codec import V5, quote
 from appliance.mqtt.packets import Subscription
@@ -189,7 +191,8 @@ class Line:
             self._at_once.clear()
             await asyncio.sleep(interval)
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._at_once.wait(), wait)
+                async with timeout(wait):
+                    await self._at_once.wait()
 
     async def _attempt(self) -> float:
         """One connection, from its dial to its end; returns the seconds until the next."""

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any, Final, TypeAlias
 
 import orjson
+from async_timeout import timeout
 
 from appliance.broker.limits import Terms
 from appliance.mqtt.codec import Properties, Property, reason_name
@@ -182,7 +183,8 @@ class Api:
 
         request.allow(2 * LONGEST_ANSWER)
         try:
-            return await asyncio.wait_for(carried(), LONGEST_ANSWER)
+            async with timeout(LONGEST_ANSWER):
+                return await carried()
         except asyncio.TimeoutError:
             return _error(504, "timeout", f"not done within {LONGEST_ANSWER:g} s")
         except RefusedError as error:
@@ -192,12 +194,13 @@ class Api:
 
 
 async def _called(
-    client: CarriedClient, topic: str, payload: bytes, timeout: float
+    client: CarriedClient, topic: str, payload: bytes, patience: float
 ) -> HttpResponse:
     try:
-        answer = await asyncio.wait_for(client.call(topic, payload, JSON), timeout)
+        async with timeout(patience):
+            answer = await client.call(topic, payload, JSON)
     except asyncio.TimeoutError:
-        return _error(504, "timeout", f"no answer from {topic} within {timeout:g} s")
+        return _error(504, "timeout", f"no answer from {topic} within {patience:g} s")
     if user_properties(answer).get("status") != "error":
         return HttpResponse(200, answer.payload, JSON)
     try:

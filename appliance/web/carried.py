@@ -14,6 +14,8 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Any, Final, TypeVar, cast
 
+from async_timeout import timeout
+
 from appliance.mqtt.codec import V5, Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
@@ -102,7 +104,8 @@ class CarriedClient:
             return
         await self._send(message, Disconnect())
         with contextlib.suppress(EOFError, asyncio.TimeoutError):
-            await asyncio.wait_for(self._next(Puback), GOODBYE)  # none comes: to the end
+            async with timeout(GOODBYE):
+                await self._next(Puback)  # none comes: to the end
 
     async def call(self, topic: str, payload: bytes, content_type: str) -> Publish:
         """The answer to a call of a service, an action or a verb; the caller limits the time."""

@@ -10,6 +10,8 @@ import ssl
 from collections.abc import Callable, Coroutine
 from typing import Protocol
 
+from async_timeout import timeout
+
 from appliance.broker.broker import Broker
 from appliance.broker.limits import Anonymous
 from appliance.broker.values import WRONG_LOGIN, Action, Decision, Identity, Refusal, TlsInfo
@@ -92,7 +94,8 @@ class WebLogin:
             answered = asyncio.Event()
             if asked.is_pending((who, Action.RECEIVE, topic), answered.set):
                 try:
-                    await asyncio.wait_for(answered.wait(), left)
+                    async with timeout(left):
+                        await answered.wait()
                 except asyncio.TimeoutError:
                     break
             decision = router.decide(who, Action.RECEIVE, topic)

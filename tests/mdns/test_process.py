@@ -11,11 +11,11 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import psutil
 import pytest
-from waiting import PATIENCE, until
+from waiting import until
 
 from appliance.mdns import process as announcing
 from appliance.mdns.announcement import SECURE_MQTT, Announcement, Service
@@ -114,17 +114,34 @@ async def test_one_that_fails_is_tried_less_and_less(
     assert [args[1] for args in found if isinstance(args, tuple)][:4] == [0.01, 0.02, 0.04, 0.05]
 
 
-async def test_a_cancellation_that_comes_with_the_end_is_not_lost() -> None:
+@pytest.mark.parametrize("rounds", range(4))
+async def test_a_cancellation_that_comes_with_the_end_is_not_lost(rounds: int) -> None:
     """The appliance stops by it, whatever the program does meanwhile."""
     is_over = asyncio.Event()
-    waiting = asyncio.create_task(announcing._at_most(PATIENCE, is_over.wait()))
+
+    class Ending:
+        """A program whose output ends when it is over."""
+
+        async def read(self, size: int) -> bytes:
+            await is_over.wait()
+            return b""
+
+        async def wait(self) -> int:
+            return 0
+
+    process = Ending()
+    process.stdout = process  # type: ignore[attr-defined]
+    waiting = asyncio.create_task(announcing._ended(cast(Any, process)))
     for _ in range(3):
         await asyncio.sleep(0)
     is_over.set()
-    await asyncio.sleep(0)  # now its work has ended
-    waiting.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await waiting
+    for _ in range(rounds):
+        await asyncio.sleep(0)
+    if waiting.cancel():
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+    else:
+        assert rounds, "it has ended before it could be cancelled"
 
 
 async def test_one_that_is_not_there() -> None:

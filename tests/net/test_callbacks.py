@@ -107,6 +107,20 @@ def test_nobody_hands_a_callback_to_the_loop_but_the_entries():
     assert not found, "\n".join(found)
 
 
+def test_nobody_waits_in_a_way_that_loses_a_cancellation():
+    """Before Python 3.12 `asyncio.wait_for` does when what it waits for ends in the same round."""
+    found = [
+        f"appliance/{name}:{node.lineno}: use async_timeout.timeout"
+        for name, tree in sources()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and node.attr == "wait_for"
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "asyncio"
+    ]
+    assert not found, "\n".join(found)
+
+
 def is_contained(method: ast.FunctionDef) -> bool:
     """By its decorator, or as all of it is one `try` that catches every exception."""
     for decorator in method.decorator_list:

@@ -12,6 +12,8 @@ import time
 from collections.abc import Iterator
 from typing import Any, Final
 
+from async_timeout import timeout
+
 from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
 from appliance.config import Settings
@@ -106,8 +108,8 @@ async def _dial(link: UpstreamSettings, server: ServerUrl) -> _Outcome | DialErr
     try:
         proxy = None if link.proxy is None else parse_proxy(link.proxy)
         tls = dialled_tls(link, server)
-        dialling = dial(server, tls, proxy, around, STEP_TIMEOUT)
-        transport = await asyncio.wait_for(dialling, TIMEOUT)
+        async with timeout(TIMEOUT):
+            transport = await dial(server, tls, proxy, around, STEP_TIMEOUT)
     except DialError as error:
         return error
     except asyncio.TimeoutError:

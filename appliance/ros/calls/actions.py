@@ -28,6 +28,8 @@ from functools import partial
 from itertools import takewhile
 from typing import Any, Literal
 
+from async_timeout import timeout
+
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
@@ -312,7 +314,8 @@ class ActionRoutes:
         cancels = [cancel for action in self._all() for cancel in action.orphan_cancels()]
         if cancels:
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(asyncio.gather(*cancels), STOP_TIMEOUT)
+                async with timeout(STOP_TIMEOUT):
+                    await asyncio.gather(*cancels)
 
     async def stop(self) -> None:
         """Clear what is retained, once the bus has been left."""
@@ -588,7 +591,8 @@ class BridgedAction:
     async def _check(self, goal: Goal, type_name: str) -> None:
         # A server that works on the goal does not answer until it is done.
         try:
-            await asyncio.wait_for(self._ask_result(goal, type_name), CHECK_TIMEOUT)
+            async with timeout(CHECK_TIMEOUT):
+                await self._ask_result(goal, type_name)
         except asyncio.TimeoutError:
             return
         except CallError as error:
@@ -649,7 +653,8 @@ class BridgedAction:
     async def _cancel_quietly(self, id_: bytes, why: str) -> None:
         """Cancel a goal for no caller: how that ends goes to the log."""
         try:
-            await asyncio.wait_for(self._cancel(id_), self.route.timeout)
+            async with timeout(self.route.timeout):
+                await self._cancel(id_)
         except CallError as error:
             if error.code != "unknown_goal":
                 log.warning("goal %s of %s is not cancelled: %s", id_.hex(), self.ros, error)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pybase64
+from async_timeout import timeout
 
 from appliance.ros.calls.context import CallContext
 from appliance.ros.calls.dispatcher import Call, CallError
@@ -191,10 +192,9 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         while node.is_stale and not node.is_gone:
             node.is_stale = False
             try:
-                values = await asyncio.wait_for(self._get_all(node), READ_TIMEOUT)
+                async with timeout(READ_TIMEOUT):
+                    values = await self._get_all(node)
             except (CallError, ConversionError, asyncio.TimeoutError) as error:
-                if self._is_stopped:  # up to Python 3.11 wait_for may forget that it is cancelled
-                    return
                 why = str(error) or "no answer"
                 node.problem = f"its parameters cannot be read: {why}"
                 if not has_failed:
