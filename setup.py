@@ -53,7 +53,7 @@ UPSTREAM = (
 
 
 #: What mypy has to see beside the compiled modules, to know the types of all that these import.
-COMPILE_NEEDS = ["mypy[mypyc]>=2.4", "pydantic>=2.10", "types-PyYAML>=6.0.12"]
+COMPILE_NEEDS = ["async-timeout>=5", "mypy[mypyc]>=2.4", "pydantic>=2.10", "types-PyYAML>=6.0.12"]
 
 #: Commands of setuptools that compile nothing: pip asks for what the build needs, then for the
 #: metadata, each in a run of its own; an sdist is the sources.
