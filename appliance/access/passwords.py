@@ -136,6 +136,10 @@ class Passwords:
         """The names of all users, sorted."""
         return sorted(self._hashes)
 
+    def first(self) -> str | None:
+        """The user of the first line, whom `init` has made; None when there is none."""
+        return next(iter(self._hashes), None)
+
     def hash_of(self, username: str) -> str | None:
         """The hash of a user's password; None when there is no such user."""
         return self._hashes.get(username)

@@ -384,6 +384,7 @@ class App:
             settings.robot,
             ros_settings.call_routes(settings),
             diagnostics=bridge.diagnostics,
+            home_assistant=bridge.home_assistant,
         )
         self._stack.push_async_callback(self.bridge.stop)
         self.bridge.start()

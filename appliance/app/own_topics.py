@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from appliance.broker.retained import RetainedMessages
 from appliance.config import Settings
+from appliance.ros.home_assistant import FILTER, bridged_at
 
 
 def orphaned_topics(retained: RetainedMessages, settings: Settings) -> list[str]:
     """Topics at which an earlier run has said what no part of this one would take back.
 
-    They are of links that were removed meanwhile, of a bridge where there is none any more, and of
-    a robot that had another name. What a user has retained at such a topic stays.
+    They are of links that were removed meanwhile, of a bridge where there is none any more (also
+    what it has told Home Assistant), and of a robot that had another name. What a user has retained
+    at such a topic stays.
     """
     own = f"{settings.robot}/_appliance/"
     links = f"{own}upstream/"
@@ -21,8 +23,15 @@ def orphaned_topics(retained: RetainedMessages, settings: Settings) -> list[str]
         is_of_bridge = topic.startswith(own) and not topic.startswith(links)
         return topic in said or (has_bridge and is_of_bridge)
 
-    return [
+    orphaned = [
         topic
         for topic, _ in retained.find("+/_appliance/#")
         if retained.owner(topic).is_inside and not is_said(topic)
     ]
+    if not has_bridge:  # which else deletes those that are not its own
+        orphaned += [
+            topic
+            for topic, message in retained.find(FILTER)
+            if retained.owner(topic).is_inside and bridged_at(message) is not None
+        ]
+    return orphaned

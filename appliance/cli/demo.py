@@ -142,7 +142,7 @@ def instructions(
     """
     (host, port), robot = mqtts, settings.robot
     directory = (settings.file or Path("appliance.yaml")).parent
-    user = next(iter(Passwords.load(settings.broker.users).users()), "USER")
+    user = Passwords.load(settings.broker.users).first() or "USER"
     password = directory / PASSWORD_FILE
     shown = f'"$(cat {_quoted(password)})"' if password.exists() else "PASSWORD"
     login = (

@@ -484,6 +484,7 @@ class BridgeSection(_Section):
     ros_arguments: Annotated[list[str], AfterValidator(check_ros_arguments)] = []
     use_sim_time: bool = False
     diagnostics: Annotated[Duration, Field(ge=0)] = 1.0
+    home_assistant: bool = False
     defaults: RouteDefaults = _section()
     topics: list[Annotated[TopicRoute, BeforeValidator(from_names)]] = []
     services: list[Annotated[ServiceRoute, BeforeValidator(from_names)]] = []

@@ -18,6 +18,7 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Properties, Property
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.routes import CallBridge
+from appliance.ros.home_assistant import HomeAssistant
 from appliance.ros.payload.encodings.registry import CONTENT_TYPE
 from appliance.ros.skipped import Skipped, summary
 from appliance.ros.status import topic_status
@@ -51,13 +52,15 @@ class Announcements:
         robot: str,
         bridge: Announced,
         use_types: Callable[[Iterable[str]], None],
+        home_assistant: HomeAssistant,
     ) -> None:
-        """`use_types` is told of all types that are bridged."""
+        """`use_types` is told of all types that are bridged, and Home Assistant of all of it."""
         self._broker = broker
         self._entries = entries
         self._above = f"{robot}/_appliance/"
         self._bridge = bridge
         self._use_types = use_types
+        self._home_assistant = home_assistant
         #: The payloads that were published last, by the end of their topic.
         self._published: dict[str, bytes] = {}
         #: The next turn, while entries are being made; and whether they are outdated already.
@@ -97,10 +100,13 @@ class Announcements:
             entries.append(orjson.dumps(topic_status(topic, flow)))
             if not len(entries) % TURN:
                 yield
-        entries += map(orjson.dumps, bridge.calls.bridged())
+        calls = bridge.calls.bridged()
+        entries += map(orjson.dumps, calls)
         if self._publish("routes", b"[%b]" % b",".join(entries), session):
             self._use_types((*(topic.type for topic, _ in topics), *bridge.calls.types()))
         self._publish("skipped", orjson.dumps(summary(bridge.skips())), session)
+        settings = [(topic, flow.settings) for topic, flow in topics]
+        yield from self._home_assistant.work(settings, calls, session)
         self._broker.flush()
 
     def _publish(self, name: str, payload: bytes, session: Session) -> bool:

@@ -30,6 +30,7 @@ from appliance.ros.announcements import Announcements
 from appliance.ros.calls.routes import CallBridge, CallRoutes
 from appliance.ros.diagnostics import Diagnostics, DiagnosticsTopic
 from appliance.ros.graph_follower import FlowKey, GraphFollower, TopicRoutes
+from appliance.ros.home_assistant import HomeAssistant
 from appliance.ros.live import LiveFigures
 from appliance.ros.mailbox import Lane, Mailbox
 from appliance.ros.node import RosNode
@@ -106,10 +107,11 @@ class Bridge:
         calls: CallRoutes | None = None,
         *,
         diagnostics: float = 0.0,
+        home_assistant: bool = False,
     ) -> None:
         """The bridge publishes what is bridged on `{robot}/_appliance/routes`, what is not on
         `…/skipped`, while somebody looks figures on `…/live`, and every `diagnostics` seconds its
-        status on `/diagnostics`; never for 0.
+        status on `/diagnostics`; never for 0. It tells Home Assistant of its routes if wanted.
         """
         self.problem: str | None = None
         self.peers: int | None = None
@@ -125,7 +127,11 @@ class Bridge:
         self._faults = broker.faults
         self._entries = entries = Entries(loop, broker.faults)
         self._schemas = SchemaTopics(broker, entries, robot, node.describe)
-        self._announcements = Announcements(broker, entries, robot, self, self._schemas.replace)
+        #: Whether Home Assistant is told of what is bridged, which a reload changes.
+        self.home_assistant = HomeAssistant(broker, robot, home_assistant)
+        self._announcements = Announcements(
+            broker, entries, robot, self, self._schemas.replace, self.home_assistant
+        )
         self._session: Session | None = None
         self._cleanup = RetainedCleanup(broker, entries)
         self._live = LiveFigures(broker, entries, robot)
@@ -502,7 +508,11 @@ class Bridge:
     def clean_up_retained(self) -> None:
         """Delete retained messages of routes that are gone, of this run and earlier ones."""
         if self._session is not None:
-            owners = TopicOwners((route.settings for route in self._routes), self.calls.routes)
+            owners = TopicOwners(
+                [route.settings for route in self._routes],
+                self.calls.routes,
+                self.home_assistant.is_on,
+            )
             self._cleanup.start(self._session, owners)
 
     # GraphEvents

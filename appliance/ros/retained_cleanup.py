@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
@@ -12,6 +12,7 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.routes import CallRoutes
+from appliance.ros.home_assistant import bridged_at
 from appliance.ros.patterns import Names
 from appliance.ros.topics.route import TopicSettings
 
@@ -34,7 +35,10 @@ def is_of_route(message: Message) -> bool:
 class TopicOwners:
     """Knows which topics the present routes may publish on."""
 
-    def __init__(self, routes: Iterable[TopicSettings], calls: CallRoutes) -> None:
+    def __init__(
+        self, routes: Sequence[TopicSettings], calls: CallRoutes, home_assistant: bool = False
+    ) -> None:
+        """`home_assistant`: whether it is told of the routes."""
         self._topics = [
             _Template(route.mqtt, "{ros}", route.names)
             for route in routes
@@ -44,6 +48,11 @@ class TopicOwners:
         self._parameters = [
             (_Template(route.mqtt, "{node}"), Names(route.names)) for route in calls.parameters
         ]
+        self._entities: list[_Template] = []
+        if home_assistant:
+            shown = [(route.mqtt, route.names) for route in routes if route.to != "ros"]
+            called = [(route.mqtt, route.names) for route in calls.services]
+            self._entities = [_Template(mqtt, "{ros}", names) for mqtt, names in shown + called]
 
     def has(self, topic: str) -> bool:
         """Whether it may be the topic of a route, whether or not its ROS node is there."""
@@ -58,6 +67,10 @@ class TopicOwners:
             if node is not None and f"{node.rstrip('/')}/{parameter}" in names:
                 return True
         return False
+
+    def has_entity(self, of: str) -> bool:
+        """Whether Home Assistant has an entity of a route with this topic."""
+        return any(template.name(of) is not None for template in self._entities)
 
 
 class RetainedCleanup:
@@ -97,8 +110,14 @@ class RetainedCleanup:
                 has_more = True
                 break
             topic, message = found
-            is_ours = retained.owner(topic).is_inside and is_of_route(message)
-            if is_ours and not owners.has(topic):
+            if not retained.owner(topic).is_inside:
+                continue
+            entity_of = bridged_at(message)
+            if entity_of is not None:
+                is_orphan = not owners.has_entity(entity_of)
+            else:
+                is_orphan = is_of_route(message) and not owners.has(topic)
+            if is_orphan:
                 orphans.append(topic)
         for topic in orphans:  # not while iterating over the retained messages
             self._broker.publish(Message(topic, b"", 0, True), session)

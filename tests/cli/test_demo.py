@@ -110,6 +110,17 @@ def test_a_demo_of_before_the_console_has_no_url(demo: Path) -> None:
     assert "https" not in told and "Ready.\n\nIn another terminal" in told
 
 
+def test_who_signs_in_is_the_first_user(demo: Path) -> None:
+    """Whose password is in the file; another may come before in the alphabet."""
+    settings = config.load(demo / "run/appliance.yaml")
+    users = settings.broker.users
+    line = users.read_text()
+    users.write_text(line + line.replace("operator:", "alice:"))
+    told = tour.instructions(settings, ("0.0.0.0", 8883), ("0.0.0.0", 8443))
+    assert "Sign in as operator;" in told
+    assert "alice" not in told
+
+
 def test_where_the_console_is(demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = config.load(demo / "run/appliance.yaml")
     monkeypatch.setattr(tour, "own_address", lambda: "10.0.0.7")

@@ -1,0 +1,333 @@
+"""Tells Home Assistant what is bridged, so that its entities are there without being configured.
+
+Each entity is a retained message of its own below `homeassistant/`, in the form that its MQTT
+integration reads: https://www.home-assistant.io/integrations/mqtt/#mqtt-discovery
+
+What an entity shows is read from the messages that the bridge publishes anyway. So only topics that
+carry JSON, text or pictures have entities. The templates are constants: no name and no value of ROS
+becomes a part of one.
+
+Home Assistant forgets an entity, and what its user has made of it, when its message is deleted. So
+that stays while a node is away, and is deleted when no route can be its own any more:
+`retained_cleanup` does that.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final, NamedTuple, cast
+
+import orjson
+
+from appliance.broker.broker import Broker
+from appliance.broker.message import Message
+from appliance.broker.session import Session
+from appliance.mqtt.codec import Properties, Property
+from appliance.ros.payload.encodings.registry import CONTENT_TYPE
+from appliance.ros.topics.route import BridgedTopic, TopicSettings
+
+log = logging.getLogger(__name__)
+
+#: In front of all topics, as Home Assistant has it if nobody changes it.
+PREFIX: Final = "homeassistant"
+
+#: The topics of entities.
+FILTER: Final = f"{PREFIX}/+/+/+/config"
+
+#: Entities that are published: a robot may have thousands of topics, and Home Assistant
+#: subscribes to each.
+MOST: Final = 1000
+
+#: Entities that are made in one turn of the event loop: less than a millisecond.
+TURN: Final = 25
+
+#: The user property that names the topic of the route that an entity is for.
+_OF: Final = "bridged-at"
+
+#: The end of the topic of calls: Home Assistant sends no Response Topic, see docs/calls.md.
+_CALLER: Final = "homeassistant"
+
+
+class _Reading(NamedTuple):
+    """What an entity reads of a message: `template` of one in JSON, `text` of one in text.
+
+    `part` tells the entities of one topic apart; the first has none. `needs` are the fields that
+    the templates read, and `extra` is what Home Assistant has to know beside them.
+    """
+
+    component: str
+    needs: tuple[str, ...]
+    template: str
+    extra: Mapping[str, object]
+    part: str = ""
+    text: str = ""
+
+
+def _number(
+    field: str, unit: str = "", device_class: str = "", part: str = "", percent: bool = False
+) -> _Reading:
+    """A sensor that shows a number; a fraction is shown in percent."""
+    value = f"value_json.{field}"
+    shown = f"({value} * 100) | round(1)" if percent else value
+    named = {"unit_of_measurement": unit, "device_class": device_class}
+    extra = {"state_class": "measurement", **{key: name for key, name in named.items() if name}}
+    template = f"{{{{ {shown} if {value} is number else None }}}}"
+    text = template.replace(value, "value_json") if field == "data" else ""
+    return _Reading("sensor", (field,), template, extra, part, text)
+
+
+def _flag(
+    field: str, condition: str, device_class: str = "", part: str = "", **extra: object
+) -> _Reading:
+    """A binary sensor that is on while the condition holds for the field."""
+    value = f"value_json.{field}"
+    template = f"{{{{ 'ON' if {value}{condition} else 'OFF' }}}}"
+    named = {"device_class": device_class} if device_class else {}
+    text = template.replace(value, "value_json") if field == "data" else ""
+    return _Reading("binary_sensor", (field,), template, {**named, **extra}, part, text)
+
+
+_PLAIN: Final = (_number("data"),)
+
+#: Seconds without an error after which a robot whose nodes publish diagnostics has no problem.
+_OFF_DELAY: Final = 15
+
+#: The types that have a counterpart in Home Assistant.
+_READINGS: Final[Mapping[str, tuple[_Reading, ...]]] = {
+    "sensor_msgs/BatteryState": (
+        _number("percentage", "%", "battery", percent=True),
+        _number("voltage", "V", "voltage", "voltage"),
+        _flag("power_supply_status", " == 1", "battery_charging", "charging"),
+    ),
+    "sensor_msgs/Temperature": (_number("temperature", "°C", "temperature"),),
+    "sensor_msgs/RelativeHumidity": (_number("relative_humidity", "%", "humidity", percent=True),),
+    "sensor_msgs/FluidPressure": (_number("fluid_pressure", "Pa", "pressure"),),
+    "sensor_msgs/Illuminance": (_number("illuminance", "lx", "illuminance"),),
+    "sensor_msgs/Range": (_number("range", "m", "distance"),),
+    "sensor_msgs/NavSatFix": (
+        _Reading(
+            "device_tracker",
+            ("latitude", "longitude"),
+            "{{ {'latitude': value_json.latitude, 'longitude': value_json.longitude} | tojson }}",
+            {"source_type": "gps"},
+        ),
+    ),
+    "diagnostic_msgs/DiagnosticStatus": (
+        _flag("level", " >= 2", "problem", entity_category="diagnostic"),
+    ),
+    # Each node tells its own: one without an error says nothing of the others.
+    "diagnostic_msgs/DiagnosticArray": (
+        _Reading(
+            "binary_sensor",
+            ("status",),
+            "{{ 'ON' if value_json.status | selectattr('level', 'ge', 2) | list else '' }}",
+            {
+                "device_class": "problem",
+                "entity_category": "diagnostic",
+                "off_delay": _OFF_DELAY,
+            },
+        ),
+    ),
+    "std_msgs/Bool": (_flag("data", ""),),
+    "std_msgs/String": (
+        # Home Assistant refuses longer states.
+        _Reading("sensor", ("data",), "{{ value_json.data[:255] }}", {}, text="{{ value[:255] }}"),
+    ),
+    **{
+        f"std_msgs/{name}": _PLAIN
+        for name in (
+            *("Float32", "Float64", "Int8", "Int16", "Int32", "Int64"),
+            *("UInt8", "UInt16", "UInt32", "UInt64"),
+        )
+    },
+}
+
+#: What else a configuration of an entity has, by the type of a service.
+_SERVICES: Final[Mapping[str, tuple[str, Mapping[str, object]]]] = {
+    # Nothing tells in which state it is: Home Assistant shows what was said last.
+    "std_srvs/SetBool": (
+        "switch",
+        {"payload_on": '{"data":true}', "payload_off": '{"data":false}', "optimistic": True},
+    ),
+    "std_srvs/Trigger": ("button", {"payload_press": "{}"}),
+    "std_srvs/Empty": ("button", {"payload_press": "{}"}),
+}
+
+#: Encodings whose payload is a picture, and the type of the message where it has to be one.
+_PICTURES: Final = {"jpeg": None, "png": None, "binary": "sensor_msgs/CompressedImage"}
+
+
+def entities_of_topic(
+    robot: str, topic: BridgedTopic, settings: TopicSettings
+) -> Iterator[tuple[str, dict[str, object]]]:
+    """The topic and the configuration of each entity that shows something of a bridged topic."""
+    if topic.direction != "to_mqtt" or settings.compression != "none":
+        return
+    kind = _without_kind(topic.type)
+    if topic.encoding in _PICTURES:
+        if _PICTURES[topic.encoding] in (None, kind):
+            yield _entity(robot, "camera", topic.ros, "", {"topic": topic.mqtt})
+        return
+    if topic.encoding not in ("json", "text"):
+        return
+    for reading in _READINGS.get(kind, ()):
+        template = reading.template if topic.encoding == "json" else reading.text
+        if not template or not _are_in(settings.fields, reading.needs):
+            continue
+        if reading.component == "device_tracker":
+            shown = {"json_attributes_topic": topic.mqtt, "json_attributes_template": template}
+        else:
+            shown = {"state_topic": topic.mqtt, "value_template": template}
+        own = {**shown, **reading.extra}
+        yield _entity(robot, reading.component, topic.ros, reading.part, own)
+
+
+def entities_of_call(
+    robot: str, call: Mapping[str, Any]
+) -> Iterator[tuple[str, dict[str, object]]]:
+    """The same for an entry of `{robot}/_appliance/routes` that is a service."""
+    found = _SERVICES.get(_without_kind(call["type"]))
+    if call["direction"] != "service" or call["encoding"] != "json" or found is None:
+        return
+    component, extra = found
+    command = {"command_topic": f"{call['mqtt']}/{_CALLER}", "qos": 1, **extra}
+    yield _entity(robot, component, call["ros"], "", command)
+
+
+def bridged_at(message: Message) -> str | None:
+    """The topic of the route that a retained message is an entity of; None if it is none."""
+    if not message.topic.startswith(f"{PREFIX}/"):
+        return None
+    pairs = (message.properties or {}).get(Property.USER_PROPERTY, [])
+    found = dict(cast("list[tuple[str, str]]", pairs))
+    return found.get(_OF)
+
+
+class HomeAssistant:
+    """Publishes the entities of what is bridged; for the loop's thread."""
+
+    def __init__(self, broker: Broker, robot: str, is_on: bool) -> None:
+        self._broker = broker
+        self._robot = robot
+        self._is_on = is_on
+        #: What the entities were made of that were published last.
+        self._made_of: object = None
+        self._has_told = False
+
+    @property
+    def is_on(self) -> bool:
+        """Whether it is told of anything."""
+        return self._is_on
+
+    def use(self, is_on: bool) -> None:
+        """From the next announcement on; `retained_cleanup` deletes what is no longer wanted."""
+        self._is_on = is_on
+        self._made_of = None
+
+    def work(
+        self,
+        topics: Iterable[tuple[BridgedTopic, TopicSettings]],
+        calls: Iterable[Mapping[str, Any]],
+        session: Session,
+    ) -> Iterator[None]:
+        """Publish the entities of all that is bridged where they have changed, turn by turn."""
+        if not self._is_on:
+            return
+        topics = list(topics)
+        services = [call for call in calls if call["direction"] == "service"]
+        made_of = (topics, services)
+        if made_of == self._made_of:
+            return
+        wanted: dict[str, tuple[str, bytes]] = {}
+        for count, (of, topic, config) in enumerate(self._entities(topics, services), 1):
+            wanted[topic] = of, orjson.dumps(config)
+            if not count % TURN:
+                yield
+        if len(wanted) > MOST and not self._has_told:
+            self._has_told = True
+            log.warning("Home Assistant is told of %d entities of %d", MOST, len(wanted))
+        for topic in [*wanted][MOST:]:
+            del wanted[topic]
+        there = {*(topic.mqtt for topic, _ in topics), *map(_base, services)}
+        self._delete_others(wanted, there, session)
+        for topic, (of, payload) in wanted.items():
+            before = self._broker.retained.get(topic)
+            if before is None or before.payload != payload:
+                self._broker.publish(Message(topic, payload, 0, True, _properties(of)), session)
+        self._made_of = made_of
+
+    def _entities(
+        self,
+        topics: Iterable[tuple[BridgedTopic, TopicSettings]],
+        services: Iterable[Mapping[str, Any]],
+    ) -> Iterator[tuple[str, str, dict[str, object]]]:
+        for bridged, settings in topics:
+            for topic, config in entities_of_topic(self._robot, bridged, settings):
+                yield bridged.mqtt, topic, config
+        for service in services:
+            for topic, config in entities_of_call(self._robot, service):
+                yield _base(service), topic, config
+
+    def _delete_others(
+        self, wanted: Mapping[str, object], there: set[str], session: Session
+    ) -> None:
+        """Delete the entities of what is there now that are not wanted: its type is another one."""
+        retained = self._broker.retained
+        others = [
+            topic
+            for topic, message in retained.find(FILTER)
+            if topic not in wanted
+            and retained.owner(topic).is_inside
+            and bridged_at(message) in there
+        ]
+        for topic in others:
+            self._broker.publish(Message(topic, b"", 0, True), session)
+
+
+def _base(service: Mapping[str, Any]) -> str:
+    """The topic of a service's route."""
+    return str(service["mqtt"]).removesuffix("/_call")
+
+
+def _properties(of: str) -> Properties:
+    return {
+        Property.CONTENT_TYPE: CONTENT_TYPE["json"],
+        Property.USER_PROPERTY: [(_OF, of)],
+    }
+
+
+def _without_kind(type_name: str) -> str:
+    """`std_msgs/Bool` of `std_msgs/msg/Bool`, as ROS 1 says it."""
+    package, _, rest = type_name.partition("/")
+    return f"{package}/{rest.rpartition('/')[2]}"
+
+
+def _are_in(fields: tuple[str, ...], needs: tuple[str, ...]) -> bool:
+    """Whether a route with these `fields` carries all that is needed."""
+    return not fields or all(
+        any(need == field or need.startswith(f"{field}.") for field in fields) for need in needs
+    )
+
+
+def _entity(
+    robot: str, component: str, ros: str, part: str, own: Mapping[str, object]
+) -> tuple[str, dict[str, object]]:
+    """The topic and the configuration of one entity.
+
+    Ids are letters, digits, `_` and `-`. ROS has no `-` in its names, and no two `/` in a row: two
+    names have two ids.
+    """
+    name = ros.strip("/")
+    id_ = re.sub(r"[^A-Za-z0-9_-]", "_", name.replace("/", "-")) + (f"--{part}" if part else "")
+    node = robot.replace(".", "--")
+    config = {
+        "name": f"{name} {part}".strip(),
+        "unique_id": f"{robot}/{component}/{id_}",
+        **own,
+        "availability_topic": f"{robot}/_appliance/state",
+        "device": {"identifiers": [f"appliance/{robot}"], "name": robot},
+        "origin": {"name": "ros-mqtt-appliance"},
+    }
+    return f"{PREFIX}/{component}/{node}/{id_}/config", config
