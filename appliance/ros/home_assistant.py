@@ -252,7 +252,11 @@ class HomeAssistant:
             del wanted[topic]
         there = {*(topic.mqtt for topic, _ in topics), *map(_base, services)}
         self._delete_others(wanted, there, session)
-        for topic, (of, payload) in wanted.items():
+        for count, (topic, (of, payload)) in enumerate(wanted.items(), 1):
+            if not count % TURN:
+                yield
+            if not self._is_on:  # meanwhile: what there was is deleted already
+                return
             before = self._broker.retained.get(topic)
             if before is None or before.payload != payload:
                 self._broker.publish(Message(topic, payload, 0, True, _properties(of)), session)

@@ -388,6 +388,30 @@ async def test_off_and_on_by_a_reload(there: Any) -> None:
         await until(lambda is_on=is_on: bool(told(there)) == is_on)
 
 
+async def test_it_is_switched_off_meanwhile(there: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(home_assistant, "TURN", 1)
+    there.start(to_mqtt("/x"), to_mqtt("/y"), on=False)
+    for name in ("/x", "/y"):
+        there.node.add_publisher(name, BOOL)
+    await until(lambda: len(there.routes()) == 2)
+    there.bridge.home_assistant.use(True)
+    work = there.bridge.home_assistant.work(
+        [
+            (BridgedTopic(name, f"r2d2{name}", BOOL, "to_mqtt", "json"), to_mqtt(name))
+            for name in ("/x", "/y")
+        ],
+        [],
+        there.bridge._session,
+    )
+    while not told(there):
+        next(work)
+    there.bridge.home_assistant.use(False)
+    there.bridge.clean_up_retained()
+    await there.settle()
+    assert list(work) == []
+    assert told(there) == {}
+
+
 async def test_another_type_has_other_entities(there: Any) -> None:
     there.start(to_mqtt("/x*"))
     publisher = there.node.add_publisher("/x", BOOL)
