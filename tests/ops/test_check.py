@@ -331,3 +331,18 @@ def test_what_a_listener_for_the_web_is_for(here: Path) -> None:
     told = [each for each in found(here, listeners=listeners) if "for the web" in each.text]
     assert [each.subject for each in told] == ["listener 127.0.0.1:8080"]
     assert "http://HOST:PORT/" in told[0].text
+
+
+def test_who_may_read_what_home_assistant_is_told(here: Path) -> None:
+    line = "topic read homeassistant/#"
+    (nobody,) = [each for each in found(here, {"home_assistant": True}) if line in each.text]
+    assert (nobody.level, nobody.subject) == ("warning", "bridge.home_assistant")
+    rules = here / "acl.conf"
+    rules.write_text(rules.read_text().replace("user alice\n", f"user alice\n{line}\n", 1))
+    (may,) = [
+        each
+        for each in found(here, {"home_assistant": True})
+        if each.subject == "bridge.home_assistant"
+    ]
+    assert (may.level, may.text) == ("ok", "alice may read homeassistant/#")
+    assert "homeassistant" not in str(found(here))

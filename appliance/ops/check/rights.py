@@ -10,6 +10,7 @@ from appliance.access.rules import Permission, Rule
 from appliance.broker.values import Action, Identity
 from appliance.config import Settings
 from appliance.ops.finding import Finding
+from appliance.ros.home_assistant import PREFIX
 
 _PLACEHOLDER = re.compile(r"\{[^/]*\}|%[A-Za-z]")
 
@@ -29,6 +30,8 @@ def rights(settings: Settings, acl: Acl, users: list[str] | None) -> Iterator[Fi
         for route in settings.bridge.topics:
             if not (route.is_exclusion or route.is_pattern) and route.to != "mqtt":
                 yield _writers(acl, users, route.names[0], route.topic(settings.robot), settings)
+        if settings.bridge.home_assistant and settings.bridge.bus != "none":
+            yield _told(acl, users, f"{PREFIX}/#", settings)
 
 
 def _mistake(rule: Rule) -> str:
@@ -61,6 +64,16 @@ def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Setting
         )
         text += f"to {settings.broker.acl.name} below the line `user {others[0]}`: {line}"
     return Finding("ok" if may else "warning", subject, text)
+
+
+def _told(acl: Acl, users: list[str], topics: str, settings: Settings) -> Finding:
+    """Who may read what Home Assistant is told."""
+    may = [name for name in users if acl.decide(Identity(name, name), Action.SUBSCRIBE, topics)]
+    if may:
+        return Finding("ok", "bridge.home_assistant", f"{_named(may)} may read {topics}")
+    text = f"no user may read {topics}: Home Assistant is told of nothing. Add to "
+    text += f"{settings.broker.acl.name} below the line `user` of its user: topic read {topics}"
+    return Finding("warning", "bridge.home_assistant", text)
 
 
 def written(topic: str, robot: str) -> str:
