@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
+from pathlib import Path
 from urllib.parse import unquote
 
 from appliance.config import ServerUrl, UpstreamSection
@@ -11,6 +13,7 @@ from appliance.config.urls import parse_server
 from appliance.upstream.limits import KINDS, kind_of_host
 
 LINK_NAME = "fleet"
+CA_FILE = "fleet-ca.crt"
 LINK_USER: str = UpstreamSection.model_fields["user"].default
 
 _SECTION = """
@@ -73,7 +76,8 @@ class FirstLink:
 
     `user_rules` are for the first user, who may publish what the link sends. `prefix` is that of
     the link; what is published at the first topic of `example` is at the second one there.
-    `password_file` is relative to appliance.yaml; it is None without a `username`.
+    `password_file` is relative to appliance.yaml; it is None without a `username`. `is_generic`:
+    the broker is none of a cloud, whose certificate every computer trusts.
     """
 
     server: ServerUrl
@@ -84,17 +88,28 @@ class FirstLink:
     example: tuple[str, str]
     username: str | None = None
     password_file: str | None = None
+    is_generic: bool = True
 
-    def next_steps(self, robot: str) -> list[str]:
-        """What is to be done before the first message arrives there."""
+    def next_steps(self, robot: str, file: Path, *, demo: bool = False) -> list[str]:
+        """What is to be done before the first message arrives there.
+
+        `file` is the appliance.yaml, as the person named it: the commands are to be copied.
+        """
         steps = []
         if self.password_file is not None:
-            steps.append(f"put the password into {self.password_file}")
+            steps.append(f"put the password into {file.parent / self.password_file}")
+        if self.server.tls and self.is_generic:
+            steps.append(
+                f"where a CA of your own has signed for {self.server.host}: copy its certificate "
+                f"to {file.parent / CA_FILE}, and take the # off the line `tls` in {file}"
+            )
         who = "this client" if self.username is None else f"the user {self.username}"
         here, there = (each.replace("{robot}", robot) for each in self.example)
         prefix = self.prefix.replace("{robot}", robot)
         steps.append(f"let {who} read and write {prefix}# at {self.server.host}")
-        steps.append("appliance check, then appliance run, then appliance upstream")
+        with_file = f"-c {shlex.quote(str(file))}"
+        for command in ("check", "demo" if demo else "run", "upstream"):
+            steps.append(f"appliance {command} {with_file}")
         steps.append(f"what is published at {here} is at {there}")
         return steps
 
@@ -126,9 +141,9 @@ def parse_first_link(url: str, vda5050: Vda5050Section | None = None) -> FirstLi
         lines.append(f"login: {{username: '{quoted}', password_file: {password_file}}}")
     elif kind != "generic":
         lines.append("tls: {certificate: fleet.crt, key: fleet.key}  # put them there")
-    elif server.tls:
+    if server.tls and kind == "generic":
         lines.append(
-            "# tls: {ca: fleet-ca.crt}          # where this computer does not trust it yet"
+            f"# tls: {{ca: {CA_FILE}}}          # where this computer does not trust it yet"
         )
     values: dict[str, object] = {"name": LINK_NAME, "server": server, "user": LINK_USER}
     values["login"] = "".join(f"    {line}\n" for line in lines)
@@ -154,4 +169,5 @@ def parse_first_link(url: str, vda5050: Vda5050Section | None = None) -> FirstLi
         example,
         username,
         password_file,
+        kind == "generic",
     )

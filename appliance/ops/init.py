@@ -268,7 +268,7 @@ def initialise(
     # The users come last, so that the password is the last thing shown.
     yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
     if first is not None:
-        yield NextSteps(first.next_steps(settings.robot))
+        yield NextSteps(first.next_steps(settings.robot, file, demo=demo))
 
 
 def call_topics(bridge: config.BridgeSection) -> list[str]:

@@ -157,6 +157,38 @@ def test_a_link_by_vda5050_says_what_to_do_next(tmp_path: Path) -> None:
     assert "published at r2/vda5050/state is at uagv/v2/acme/r2/state" in said
 
 
+@pytest.mark.parametrize("user", ["", "r2@"])
+def test_a_broker_with_a_ca_of_its_own(
+    user: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the next steps say, typed as it is said, from the folder above."""
+    monkeypatch.chdir(tmp_path)
+    steps = list(initialise(Path("my r2"), robot="r2", upstream=f"mqtts://{user}broker.example"))
+    (said,) = [each.texts for each in steps if isinstance(each, NextSteps)]
+    file = Path("my r2/appliance.yaml")
+    if user:
+        assert said[0] == "put the password into my r2/fleet.password"
+        (file.parent / "fleet.password").write_text("hunter2\n")
+    step = "where a CA of your own has signed for broker.example: copy its certificate to "
+    step += "my r2/fleet-ca.crt, and take the # off the line `tls` in my r2/appliance.yaml"
+    assert step in said
+    file.write_text(file.read_text().replace("# tls: {ca", "tls: {ca"))
+    authority = (file.parent / "certs/ca.crt").read_bytes()
+    (file.parent / "fleet-ca.crt").write_bytes(authority)
+    assert troubles(file.parent) == []
+    (link,) = upstreams(config.load(file))
+    assert link.tls.ca == (file.parent / "fleet-ca.crt").absolute()
+    commands = [f"appliance {verb} -c 'my r2/appliance.yaml'" for verb in ("check", "run")]
+    assert [each for each in said if each in commands] == commands
+
+
+def test_what_a_cloud_or_the_demo_does_next(tmp_path: Path) -> None:
+    steps = list(initialise(tmp_path, upstream="mqtts://x.iot.eu-west-1.amazonaws.com", demo=True))
+    (said,) = [each.texts for each in steps if isinstance(each, NextSteps)]
+    assert not [each for each in said if "CA of your own" in each]
+    assert f"appliance demo -c {tmp_path / 'appliance.yaml'}" in said
+
+
 def test_vda5050_is_of_a_link(tmp_path: Path) -> None:
     with pytest.raises(InitError, match="--vda5050 needs --upstream"):
         list(initialise(tmp_path / "new", manufacturer="acme"))
