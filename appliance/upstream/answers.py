@@ -24,7 +24,7 @@ from collections.abc import Callable
 from typing import Final
 
 from appliance.mqtt.codec import text_size
-from appliance.mqtt.topics import MAX_TOPIC, check_topic
+from appliance.mqtt.topics import MAX_TOPIC, check_topic, matches
 from appliance.upstream.rules import UpstreamSettings
 
 #: Seconds after which nobody waits for an answer: longer than every timeout of calls.
@@ -130,6 +130,7 @@ class Answers:
     """The Response Topics of one link, both ways. Times in seconds of any clock."""
 
     def __init__(self, settings: UpstreamSettings, new: Callable[[], str] = new_token) -> None:
+        self._settings = settings
         self._here = settings.answers_here
         self._there = settings.answers_there
         self._coming = _Tokens(new)
@@ -143,12 +144,23 @@ class Answers:
         """The Response Topic here of a request that came in on `topic`, as it is there.
 
         Without one it is that of MQTT 3.1.1's calls with a token. None: there is no way to answer,
-        or the Response Topic is none that a client may publish to.
+        or the Response Topic is none that a client may publish to, or one of the robot's own.
         """
         wanted = reply_topic(topic) if response_topic is None else response_topic
-        if wanted is None or not _may_be_answered(wanted):
+        if wanted is None or not _may_be_answered(wanted) or self._is_the_robots(wanted):
             return None
         return self._here + self._coming.issue(wanted, now)
+
+    def _is_the_robots(self, topic: str) -> bool:
+        """Whether an answer at a topic there would be taken for a message of the robot, or for a
+        command to it: the fleet's broker lets the robot publish it, and perhaps not the caller."""
+        settings = self._settings
+        if topic == settings.state_there or topic.startswith(settings.answers_there):
+            return True
+        if "/_reply/" in topic:  # which are for answers, also below a rule for everything
+            return False
+        rules = (*settings.out, *settings.inward)
+        return any(matches(rule.remote_filter, topic) for rule in rules)
 
     def for_answer_out(self, topic: str, now: float) -> str | None:
         """The topic there of an answer that was published here; None when it is for nobody."""

@@ -37,6 +37,16 @@ def test_a_request_from_there_is_answered_there(answers: Answers) -> None:
     assert answers.for_answer_in("fleet/r2/_answers/t0", 1.0) is None
 
 
+def test_an_answer_is_not_taken_for_a_message_of_the_robot() -> None:
+    """Who may only call cannot make the robot say that it is online, or command it."""
+    answers = Answers(link('out: [{topic: "events/#"}], in: [{topic: cmd_vel}]'))
+    for topic in ("_appliance/state", "_answers/0", "events/alarm", "cmd_vel"):
+        assert answers.for_request_in("x", f"fleet/r2/{topic}", 0.0) is None, topic
+    assert len(answers) == 0
+    for topic in ("r2/reset/_reply/alice/1", "r2/events/_reply/alice", "r2/other", "r3/events/x"):
+        assert answers.for_request_in("x", f"fleet/{topic}", 0.0), topic
+
+
 def test_a_request_from_here_is_answered_here(answers: Answers) -> None:
     there = answers.for_request_out("clients/bob/answers", 0.0, "bob")
     assert there == "fleet/r2/_answers/t0"
