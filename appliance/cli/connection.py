@@ -142,7 +142,8 @@ class CallTarget(ConnectionOptions):
     robot: Annotated[
         str | None,
         typer.Option(
-            help="The robot, the first level of its topics; default: from the configuration."
+            help="The robot, the first level of its topics; default: from the configuration. "
+            "Through a fleet's broker with what stands before it there: fleet/r2d2."
         ),
     ] = None
 

@@ -80,7 +80,12 @@ class RpcClient:
 
         message = self._wait_for(answer, timeout)
         if message is None:
-            raise ClientError(f"no answer from {topic} within {timeout:g} s{self._version_hint()}")
+            who = self._target.username or "this client"
+            raise ClientError(
+                f"no answer from {topic} within {timeout:g} s{self._version_hint()}. Through a "
+                f"fleet's broker: is the robot online there, and may {who} read {replies}/#? "
+                "mosquitto does not say that; the call may have been carried out"
+            )
         value = decode(message)
         if isinstance(value, dict) and isinstance(value.get("error"), dict):
             error = value["error"]
@@ -120,7 +125,8 @@ class RpcClient:
         if code.value == NO_MATCHING_SUBSCRIBERS:
             raise ClientError(
                 f"nothing takes calls at {topic}: no route is for it, or it is not on the bus; "
-                f"`appliance routes` shows what is. {_as_ros_name(topic)}".rstrip()
+                "`appliance routes` shows what is. Through a fleet's broker: the robot is offline, "
+                f"or its link has no rule in `in` for this topic. {_as_ros_name(topic)}".rstrip()
             )
 
     def _version_hint(self) -> str:

@@ -164,6 +164,23 @@ def test_a_publish_that_the_acl_refuses(peer: Peer, capfd: pytest.CaptureFixture
     assert "The ACL line that allows it: `topic write other`, below `user alice` or in" in error
 
 
+@pytest.mark.parametrize(
+    ("version", "said"),
+    [
+        ("5", "nothing takes calls at robot/reset/_call: "),
+        ("311", "may alice read robot/reset/_reply/phone/#? mosquitto does not say that"),
+    ],
+)
+def test_a_call_through_a_fleets_broker_that_no_robot_answers(
+    peer: Peer, version: str, said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    options = ("-V", version, "-W", "0.2", "-i", "phone", "--robot", "robot", "/reset")
+    with pytest.raises(SystemExit, match="1"):
+        cli.main(peer.arguments("call", *options))
+    told = capfd.readouterr().err
+    assert said in told and "Through a fleet's broker: " in told
+
+
 def test_a_port_alone_leaves_the_rest_to_the_configuration(
     peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
