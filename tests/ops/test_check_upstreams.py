@@ -405,3 +405,30 @@ def test_rules_that_share_topics_in_a_useful_order(here: Path) -> None:
     rules = [{"topic": "events/door", "keep": "latest"}, {"topic": "events/+"}, {"topic": "#"}]
     moved = {"topic": "#", "local_prefix": "", "remote_prefix": "all/"}
     assert troubles(here, out=[*rules, moved]) == []
+
+
+@pytest.mark.parametrize(
+    ("rule", "route", "is_told"),
+    [
+        ({"rate": 2}, {"rate": 10}, True),
+        ({"rate": 2, "keep": "all"}, {"rate": 10, "qos": 0}, True),
+        ({"rate": 2}, {"rate": 10, "qos": 0}, False),
+        ({"rate": 2}, {"rate": 10, "retain": True}, False),
+        ({"rate": 2, "keep": "latest"}, {"rate": 10}, False),
+        ({"rate": 10}, {"rate": 10}, False),
+        ({"rate": 2}, {}, False),
+        ({}, {"rate": 10}, False),
+    ],
+)
+def test_a_rule_that_sends_less_than_comes_and_keeps_the_rest(
+    here: Path, rule: dict[str, Any], route: dict[str, Any], is_told: bool
+) -> None:
+    with (here / "acl.conf").open("a") as file:
+        file.write("topic read {robot}/odom\n")
+    bridge = {"topics": [{"ros": "/odom", "to": "mqtt", **route}]}
+    told = troubles(here, bridge=bridge, out=[{"topic": "odom", **rule}])
+    expected = (
+        "warning out odom: rate 2 is less than the 10 a second of the route /odom, and with QoS 1 "
+        "all that is not sent waits, longer and longer; add: keep: latest"
+    )
+    assert told == ([expected] if is_told else [])

@@ -45,6 +45,7 @@ def link_rules(settings: Settings, link: UpstreamSettings, acl: Acl | None) -> I
     texts += _without_publisher(settings, link, acl)
     texts += _without_call(settings, link)
     texts += _too_short(link)
+    texts += _slower_than_its_routes(settings, link)
     for text in texts:
         yield Finding("warning", subject, text)
 
@@ -187,3 +188,28 @@ def _too_short(link: UpstreamSettings) -> Iterator[str]:
                 "commands are dropped: how old one can be is known from pings, of which there is "
                 f"one every {format_duration(SHORTEST_PING)} at most"
             )
+
+
+def _slower_than_its_routes(settings: Settings, link: UpstreamSettings) -> Iterator[str]:
+    """Rules that send less than a route publishes, and keep the rest, which then only grows.
+
+    Without a rate of the route nobody knows how much comes.
+    """
+    if settings.bridge.bus == "none":
+        return
+    for route in settings.bridge.topics:
+        if route.is_exclusion or route.to == "ros" or route.rate is None:
+            continue
+        topics = command_filters(route, settings.robot)
+        # Without `qos` the publisher on ROS decides: a reliable one has QoS 1.
+        qos = 1 if route.qos is None else route.qos
+        for out in link.out:
+            if any(overlaps(out.local_filter, each) for each in topics):
+                is_slower = out.rate is not None and out.rate < route.rate
+                if is_slower and out.kept(qos, route.retain is True) == "all":
+                    yield (
+                        f"out {out.topic}: rate {out.rate:g} is less than the {route.rate:g} a "
+                        f"second of the route {route.names[0]}, and with QoS 1 all that is not "
+                        "sent waits, longer and longer; add: keep: latest"
+                    )
+                break
