@@ -28,11 +28,24 @@ NAMES = [page.name for page in PAGES]
 LONGEST_README = 200
 
 
+def parts(line: str) -> Iterator[list[str]]:
+    """The words of each command of a line, of a redirection's file too."""
+    lexer = shlex.shlex(line, posix=True, punctuation_chars="&|;>")
+    lexer.whitespace_split = True
+    words: list[str] = []
+    for word in lexer:
+        if {*word} <= {*"&|;>"}:
+            yield words
+            words = []
+        else:
+            words.append(word)
+    yield words
+
+
 def invocations(page: Page) -> Iterator[list[str]]:
     """The words behind `appliance` of each line that calls it."""
     for line in page.commands():
-        for part in re.split(r"&&|\||>|;", line):
-            words = shlex.split(part, comments=True)
+        for words in parts(line):
             while words and (words[0] == "sudo" or re.match(r"[A-Z_]+=", words[0])):
                 del words[0]
             if words and Path(words[0]).name == "appliance":
