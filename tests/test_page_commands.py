@@ -138,7 +138,7 @@ NEED_ROBOT = re.compile(r"appliance (call|goal|param) |make run |mosquitto_|-v d
 SAME_ANSWER = re.compile(r"mosquitto_rr |appliance (call -u alice|param get) ")
 
 HAS_ROS = importlib.util.find_spec("rclpy") is not None
-#: test_fleet_page.py types the page of a fleet, which has two appliances.
+#: fleet_page.py types the page of a fleet, on demand: two appliances, and minutes.
 PAGES = [page for page in pages() if page.name != "docs/fleet.md"]
 
 #: A page's bus and its first user.
