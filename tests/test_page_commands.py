@@ -61,6 +61,19 @@ NOT_RUN = {
     "git push origin v1.2.3": "needs another computer",
     "gpg --armor --detach-sign dist/SHA256SUMS": "needs a person's key",
     "appliance bench --upstream --messages 1000000": "takes ten minutes; tests/bench has its parts",
+    "appliance bench --broker --rounds 3 --peer mosquitto"
+    " --peer ./mosquitto-2.1.2": "needs what CONTRIBUTING.md builds; tests/bench has two",
+    "appliance bench --broker --rounds 3 --peer ./mosquitto-2.1.2": "the same",
+    "sudo apt install cmake g++ libssl-dev libcjson-dev": "changes the system",
+    "curl -fO https://deb.debian.org/debian/pool/main/m/mosquitto/"
+    "mosquitto_2.1.2.orig.tar.gz": "needs a network",
+    "echo a8e37cc4c1d4141e56c5a8729c5fa36b1f0b1ca95378a12131d68f0509de122a"
+    " mosquitto_2.1.2.orig.tar.gz | sha256sum -c": "needs what the line before fetches",
+    "mkdir source && tar -xf mosquitto_2.1.2.orig.tar.gz -C source"
+    " --strip-components=1": "the same",
+    "cmake -S source -B out -DCMAKE_BUILD_TYPE=Release -DWITH_WEBSOCKETS=OFF -DWITH_TESTS=OFF"
+    " -DWITH_CLIENTS=OFF -DWITH_APPS=OFF -DWITH_PLUGINS=OFF -DWITH_DOCS=OFF": "the same",
+    "make -C out mosquitto && cp out/src/mosquitto mosquitto-2.1.2": "the same",
     "scp dist/appliance robot:": "needs another computer",
     "python3.12 -m venv --system-site-packages ~/appliance"
     " && ~/appliance/bin/pip install .": "needs Python 3.12 and a network",
@@ -100,8 +113,8 @@ ADDED = (
     (r"^curl ", "-sS --fail-with-body --retry 10 --retry-all-errors"),  # until all is ready
     (r"appliance sub |mosquitto_sub ", "-C 1 -W 30"),
     (r"appliance user (add|passwd) (?!.*--generate)", "--generate"),  # there is no terminal to ask
-    (r"short-bench (?!.*growth)", "--seconds 0.2"),
-    (r"short-bench .*growth", "--seconds 1"),
+    (r"short-bench (?!.*growth)", "--seconds 0.2 --rounds 1"),
+    (r"short-bench .*growth", "--seconds 1 --rounds 1"),
     *([(r"single-file ", "--dry-run")] if os.geteuid() else []),
 )
 
@@ -111,12 +124,12 @@ PROGRAMS = {
     "single-file": "import sys; sys.frozen, sys.executable = True, __file__",
     # One cell of the broker, one of the bridge, and those that are named, small.
     "short-bench": """\
-import dataclasses, functools, sys
+import dataclasses, sys
 from appliance.bench import cells, command, growth
 kept = [each for each in cells.CELLS if each.name in ("qos0-pair", "ros-to-mqtt")]
 cells.CELLS = command.CELLS = tuple(kept)
+cells.BROKER = tuple(kept[:1])
 growth.RUNS, growth.SETTLE_SECONDS = 1, 0.1
-command.compare = functools.partial(command.compare, repeats=1)
 command.GROWTH = tuple(
     dataclasses.replace(each, size=40) for each in growth.GROWTH
     if each.name in sys.argv)""",

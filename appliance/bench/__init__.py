@@ -1,6 +1,13 @@
-"""`appliance bench`: this broker and mosquitto, side by side, under the same load."""
+"""`appliance bench`: this broker and mosquittos, side by side, under the same load."""
 
 from __future__ import annotations
+
+
+def broker_cells() -> list[str]:
+    """The names of the cells that compare the broker alone with mosquitto."""
+    from appliance.bench.cells import BROKER
+
+    return [cell.name for cell in BROKER]
 
 
 def bridge_cells() -> list[str]:
@@ -20,17 +27,19 @@ def upstream_cells() -> list[str]:
 def main(
     cells: list[str] | None,
     seconds: float,
-    peer: str | None,
+    peers: list[str] | None,
     as_json: bool,
     messages: int | None = None,
+    rounds: int = 3,
 ) -> int:
     """Measure and print; returns the exit status, 0 when every cell ran.
 
     `cells` are names of CELLS (None: all but those of links), `seconds` is the length of one run,
-    and `peer` the mosquitto to compare with (None: the one that is installed). `messages` wait for
-    a link in its cells. Unmet goals are no failure.
+    `peers` are the mosquittos to compare with (None: the one that is installed), and `rounds` is
+    how often each cell is measured. `messages` wait for a link in its cells. Unmet goals are no
+    failure.
     """
     # Imported here, as the processes of the load import this package too and need none of it.
     from appliance.bench import command
 
-    return command.main(cells, seconds, peer, as_json, messages)
+    return command.main(cells, seconds, peers, as_json, messages, rounds)

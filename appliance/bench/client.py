@@ -113,12 +113,18 @@ def connect_packet(
 
 
 def publish_packet(
-    topic: str, payload: bytes, packet_id: int | None = None, retain: bool = False
+    topic: str,
+    payload: bytes,
+    packet_id: int | None = None,
+    retain: bool = False,
+    *,
+    qos: int = 1,
 ) -> bytes:
-    """PUBLISH with QoS 1, or QoS 0 without a packet identifier (section 3.3)."""
+    """PUBLISH with QoS 1 or another, or QoS 0 without a packet identifier (section 3.3)."""
     if packet_id is None:
         return packet(0x30 | retain, field(topic.encode()) + payload)
-    return packet(0x32 | retain, field(topic.encode()) + packet_id.to_bytes(2, "big") + payload)
+    first = 0x30 | qos << 1 | retain
+    return packet(first, field(topic.encode()) + packet_id.to_bytes(2, "big") + payload)
 
 
 def subscribe_packet(filters: Sequence[str], qos: int) -> bytes:

@@ -26,7 +26,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from appliance.bench.client import LoadClient, LoadError, LoadTarget, publish_packet, reporting
-from appliance.bench.load import RECEIVE_BYTES, Result, cpu_seconds, percentile, pin
+from appliance.bench.load import Result, cpu_seconds, percentile, pin
+from appliance.bench.load_clients import RECEIVE_BYTES
 from appliance.bench.probe import print_answer
 
 PAYLOAD_BYTES = 100

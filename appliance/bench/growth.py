@@ -18,7 +18,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -32,8 +33,9 @@ from appliance.bench.client import (
     subscribe_packet,
 )
 from appliance.bench.crowd import CONNECT_SECONDS
-from appliance.bench.load import Load, LoadSubscriber, MessageFlow, cpu_seconds, resident_kib
-from appliance.bench.peers import PASSWORD_VARIABLE, PeerError, Server, Site, last_lines
+from appliance.bench.load import cpu_seconds, resident_kib
+from appliance.bench.load_clients import Load, LoadSubscriber, MessageFlow
+from appliance.bench.peers import PASSWORD_VARIABLE, Peer, PeerError, Server, Site, last_lines
 
 StartBroker: TypeAlias = (
     "Callable[[], AbstractContextManager[Server]]"  # starts another broker at each call
@@ -95,11 +97,11 @@ class GrowthCell:
 
 @dataclass(frozen=True, slots=True)
 class GrowthRow:
-    """The result of one cell on both brokers; None where it did not run."""
+    """The result of one cell on all brokers, of peers by name; absent where it did not run."""
 
     cell: GrowthCell
     ours: Figures | None = None
-    peer: Figures | None = None
+    peers: Mapping[str, Figures] = field(default_factory=dict)
     problem: str | None = None
     missing: str | None = None
 
@@ -482,11 +484,11 @@ GROWTH: tuple[GrowthCell, ...] = (
 
 def grow(
     cell: GrowthCell,
-    command: str | None,
+    others: Sequence[Peer],
     seconds: float,
     progress: Progress = lambda text: None,
 ) -> GrowthRow:
-    """Measure one cell on this broker, and on the peer if there is one."""
+    """Measure one cell on this broker, and on the peers if there are some."""
     if missing := cell.missing():
         return GrowthRow(cell, missing=missing)
     measured: dict[str, Figures] = {}
@@ -497,16 +499,15 @@ def grow(
         starts: dict[str, StartBroker] = {
             "appliance": lambda: peers.appliance(site, [], os.environ)
         }
-        if command is not None:
-            starts["mosquitto"] = lambda: peers.mosquitto(command, site)
+        for peer in others:
+            starts[peer.name] = partial(peers.mosquitto, peer, site)
         for name, start in starts.items():
             try:
                 measured[name] = cell.measure(start, seconds, _named(name, progress))
             except (PeerError, LoadError, OSError) as error:
                 problems.append(f"{name}: {error}")
-    return GrowthRow(
-        cell, measured.get("appliance"), measured.get("mosquitto"), "; ".join(problems) or None
-    )
+    ours = measured.pop("appliance", None)
+    return GrowthRow(cell, ours, measured, "; ".join(problems) or None)
 
 
 def _named(name: str, progress: Progress) -> Progress:

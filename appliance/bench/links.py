@@ -18,7 +18,7 @@ from appliance.bench.cells import Cell, Side
 from appliance.bench.drain import HERE, HIGH, THERE
 from appliance.bench.growth import Subprocess, probing, program
 from appliance.bench.load import Result
-from appliance.bench.peers import USER, Server, Site
+from appliance.bench.peers import USER, Peer, Server, Site
 
 WINDOW = 1000  # the appliance's default; for mosquitto its max_inflight_messages
 MESSAGES = 100_000
@@ -59,7 +59,7 @@ class LinkCell(Cell):
 
     round_trip: float = 0.0  # seconds
     messages: int = MESSAGES
-    fleet: str | None = None  # the mosquitto that is the fleet's broker
+    fleet: Peer | None = None  # the mosquitto that is the fleet's broker
 
     def missing(self) -> str | None:
         """The fleet's broker."""
@@ -92,7 +92,7 @@ class LinkCell(Cell):
                 yield side
 
     @contextlib.contextmanager
-    def peer(self, site: Site, command: str) -> Iterator[Side]:
+    def peer(self, site: Site, peer: Peer) -> Iterator[Side]:
         with self._fleet(site) as (fleet, port, pids):
             bridge = f"""\
 connection fleet
@@ -105,7 +105,7 @@ remote_password {site.password}
 topic # out 1 {HERE} {THERE}
 """
             with (
-                peers.mosquitto(command, site, window=WINDOW, bridge=bridge) as server,
+                peers.mosquitto(peer, site, window=WINDOW, bridge=bridge) as server,
                 self._side(server, fleet, pids) as side,
             ):
                 yield side

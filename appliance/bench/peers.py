@@ -1,6 +1,6 @@
-"""The brokers that are compared: this appliance and mosquitto, with equal settings.
+"""The brokers that are compared: this appliance and one mosquitto or more, with equal settings.
 
-Both have a password file, the same ACL in force, one TCP and one TLS listener on 127.0.0.1 with the
+All have a password file, the same ACL in force, one TCP and one TLS listener on 127.0.0.1 with the
 same certificate, no persistence, and the same inflight window. Defaults of mosquitto that are good
 for its figures stay (set_tcp_nodelay false takes 15 % off its QoS 1 in flight). All files are in
 one directory that the caller removes.
@@ -13,6 +13,7 @@ import contextlib
 import hashlib
 import os
 import random
+import re
 import secrets
 import shutil
 import socket
@@ -22,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -54,6 +55,8 @@ LIMITS: dict[str, object] = {  # of this broker; mosquitto has none such, or doe
     "memory": "1 GiB",
 }
 EXTRA_PATHS = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin")  # often not in a user's PATH
+OLDEST = (2, 0, 0)  # before it password files had no PBKDF2
+_VERSION = re.compile(r"^mosquitto version (\d+)\.(\d+)(?:\.(\d+))?\S*", re.MULTILINE)
 START_SECONDS = 60.0
 STOP_SECONDS = 10.0
 _NOT_OUTGOING = range(20_000, 32_768)  # ports below `net.ipv4.ip_local_port_range` of Linux
@@ -109,28 +112,89 @@ class Server:
         return shown + [option for pid in self.pids for option in ("--pid", str(pid))]
 
 
-def find_mosquitto(command: str | None) -> str | None:
-    """The path of the mosquitto to compare with, None when there is none."""
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """A mosquitto to compare with."""
+
+    command: str
+    version: tuple[int, int, int]
+    name: str  # that nothing else of the run has, such as `mosquitto 2.1.2`
+
+
+def find_peer(command: str | None = None) -> Peer:
+    """A mosquitto by its path, or by its name in PATH; None is the one that is installed.
+
+    Raises PeerError: it is not there, not executable, not mosquitto, or too old.
+    """
     path = os.pathsep.join((os.environ.get("PATH", os.defpath), *EXTRA_PATHS))
-    return shutil.which(command or "mosquitto", path=path)
+    wanted = command or "mosquitto"
+    found = shutil.which(wanted, path=path)
+    if found is None:
+        raise PeerError(_why_not_found(wanted))
+    try:
+        done = subprocess.run(
+            [found, "-h"],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=STOP_SECONDS,
+            env=for_other_programs(),
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise PeerError(
+            f"{found} does not answer -h within {STOP_SECONDS:g} s: is it mosquitto?"
+        ) from None
+    except OSError as error:
+        raise PeerError(f"{found} cannot be run: {error.strerror}") from None
+    told = _VERSION.search(done.stdout)
+    if told is None:
+        said = (done.stderr.strip() or done.stdout.strip()).partition("\n")[0] or "nothing"
+        raise PeerError(
+            f"{found} is not mosquitto, or does not start: asked with -h for its version it"
+            f" answers: {said[:200]}"
+        )
+    version = (int(told[1]), int(told[2]), int(told[3] or 0))
+    if version < OLDEST:
+        wanted = ".".join(map(str, OLDEST[:2]))
+        raise PeerError(
+            f"{found} is mosquitto {told[0].split()[-1]}, which is too old: it does not know the"
+            f" passwords of {wanted}; name one of {wanted} or later"
+        )
+    return Peer(found, version, told[0].replace(" version", ""))
 
 
-def mosquitto_version(command: str) -> str:
-    """Such as `mosquitto 2.0.11`."""
-    text = subprocess.run(
-        [command, "-h"],
-        capture_output=True,
-        text=True,
-        timeout=STOP_SECONDS,
-        env=for_other_programs(),
-        check=False,
-    ).stdout
-    return text.partition("\n")[0].replace(" version", "") or "mosquitto"
+def _why_not_found(command: str) -> str:
+    """Why there is no such program."""
+    if os.sep not in command:
+        there = "a file of this folder needs ./ before it" if Path(command).is_file() else ""
+        return f"{command} is not among the installed programs" + (there and f"; {there}")
+    if Path(command).is_dir():
+        return f"{command} is a directory: name the program in it"
+    if Path(command).exists():
+        return f"{command} is not executable: chmod +x it, or name the program itself"
+    return f"{command} is not there"
+
+
+def find_peers(commands: Sequence[str]) -> list[Peer]:
+    """Each of them, with names that differ. Raises PeerError."""
+    found: list[Peer] = []
+    for command in commands:
+        peer = find_peer(command)
+        if any(Path(peer.command).samefile(each.command) for each in found):
+            raise PeerError(f"{peer.command} is given twice")
+        found.append(peer)
+    names = [each.name for each in found]
+    return [
+        replace(each, name=f"{each.name} ({each.command})") if names.count(each.name) > 1 else each
+        for each in found
+    ]
 
 
 @contextlib.contextmanager
 def mosquitto(
-    command: str,
+    peer: Peer,
     site: Site,
     *,
     default_queues: bool = False,
@@ -170,9 +234,9 @@ keyfile {site.directory / "server.key"}
 {bridge}
 """
     )
-    argv = [command, "-c", str(directory / "mosquitto.conf")]
-    with running("mosquitto", argv, for_other_programs(), directory / "log") as process:
-        server = Server("mosquitto", site, port, tls_port, (process.pid,))
+    argv = [peer.command, "-c", str(directory / "mosquitto.conf")]
+    with running(peer.name, argv, for_other_programs(), directory / "log") as process:
+        server = Server(peer.name, site, port, tls_port, (process.pid,))
         wait_for(server, process, directory / "log")
         yield server
 

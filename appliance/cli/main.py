@@ -104,17 +104,9 @@ def _split_ros_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from importlib.machinery import ExtensionFileLoader
-        from importlib.metadata import PackageNotFoundError, version
-        from importlib.util import find_spec
+        from appliance.host.build import build
 
-        try:
-            text = f"appliance {version('ros-mqtt-appliance')}"
-        except PackageNotFoundError:
-            text = "appliance, run from its source without being installed"
-        broker = find_spec("appliance.broker.broker")
-        is_compiled = broker is not None and isinstance(broker.loader, ExtensionFileLoader)
-        typer.echo(f"{text}, {'compiled' if is_compiled else 'pure Python'}")
+        typer.echo(build())
         raise typer.Exit
 
 

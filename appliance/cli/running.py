@@ -183,6 +183,9 @@ def bench(
     cell: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Only this cell. Repeatable.")
     ] = None,
+    broker: Annotated[
+        bool, typer.Option("--broker", help="Only the comparison of the broker alone: ten cells.")
+    ] = False,
     bridge: Annotated[bool, typer.Option("--bridge", help="Only the cells of the bridge.")] = False,
     upstream: Annotated[
         bool, typer.Option("--upstream", help="Only the cells of a link to a fleet's broker.")
@@ -191,13 +194,22 @@ def bench(
     messages: Annotated[
         int | None, typer.Option(help="Messages that wait for a link.", show_default="100,000")
     ] = None,
+    rounds: Annotated[
+        int, typer.Option(help="Rounds over all cells; the medians count, with their spread.")
+    ] = 3,
     peer: Annotated[
-        str | None, typer.Option(metavar="PATH", help="The mosquitto executable to compare with.")
+        list[str] | None,
+        typer.Option(
+            metavar="PATH",
+            help="A mosquitto executable, 2.0 or later, to compare with. Repeatable.",
+            show_default="the installed one",
+        ),
     ] = None,
 ) -> None:
-    """Measure this broker, and mosquitto for comparison if it is installed."""
+    """Measure this broker, and mosquitto for comparison: the installed one or those of --peer."""
     from appliance import bench
 
-    cells = [*(cell or ()), *(bench.bridge_cells() if bridge else ())]
+    cells = [*(cell or ()), *(bench.broker_cells() if broker else ())]
+    cells += bench.bridge_cells() if bridge else ()
     cells += bench.upstream_cells() if upstream else ()
-    raise typer.Exit(bench.main(cells or None, seconds, peer, as_json, messages))
+    raise typer.Exit(bench.main(cells or None, seconds, peer, as_json, messages, rounds))

@@ -28,20 +28,29 @@ from appliance.bench.cells import (
     FloodCell,
     ImageCell,
     LoadCell,
-    Row,
-    compare,
-    median,
 )
 from appliance.bench.client import LoadError, LoadTarget
+from appliance.bench.comparison import compare
 from appliance.bench.crowd import Crowd
-from appliance.bench.growth import GROWTH, GrowthCell, GrowthRow, Statement, grow
+from appliance.bench.growth import GROWTH, GrowthCell, grow
 from appliance.bench.links import LINKS
-from appliance.bench.load import Load, LoadPublisher, LoadSubscriber, MessageFlow, Result
-from appliance.bench.peers import PeerError, Server, Site, find_mosquitto
+from appliance.bench.load import Result
+from appliance.bench.load_clients import (
+    ExactlyOncePublisher,
+    ExactlyOnceSubscriber,
+    Load,
+    LoadPublisher,
+    LoadSubscriber,
+    MessageFlow,
+    topic_of,
+)
+from appliance.bench.peers import Peer, PeerError, Server, Site, find_peer
 from appliance.mqtt.topics import check_filter, matches
 
-MOSQUITTO = find_mosquitto(None)
-needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
+PEERS: list[Peer] = []
+with contextlib.suppress(PeerError):
+    PEERS.append(find_peer())
+needs_mosquitto = pytest.mark.skipif(not PEERS, reason="mosquitto is not installed")
 
 
 def check_sane(result: Result | None) -> None:
@@ -66,9 +75,9 @@ def check_sane(result: Result | None) -> None:
     "cell", [cell for cell in CELLS if isinstance(cell, LoadCell)], ids=lambda cell: cell.name
 )
 def test_every_load_gives_sane_figures_on_both_brokers(cell: Cell) -> None:
-    row = compare(cell, MOSQUITTO, 0.3, repeats=1)
+    row = compare(cell, PEERS, 0.3, rounds=1)
     assert row.problem is None
-    for figures in (row.ours, row.peer):
+    for figures in (row.ours, row.figures(row.against)):
         assert figures is not None
         if isinstance(cell, FloodCell):
             assert figures.beside_us is not None
@@ -88,11 +97,14 @@ def test_every_bridge_gives_sane_figures_on_both_sides(
     pytest.importorskip("rclpy")
     for pace in (500, 200, 100):  # on a busy computer the tutorial node's queue of ten may run over
         monkeypatch.setattr(cells, "PACES", [pace])
-        row = compare(cell, MOSQUITTO, 1.0, repeats=1)
-        if all(each is not None and each.lost < each.messages for each in (row.ours, row.peer)):
+        row = compare(cell, PEERS, 1.0, rounds=1)
+        if all(
+            each is not None and each.lost < each.messages
+            for each in (row.ours, row.figures(row.against))
+        ):
             break
     assert row.problem is None and row.missing is None
-    for figures in (row.ours, row.peer):
+    for figures in (row.ours, row.figures(row.against)):
         assert figures is not None and figures.lost < figures.messages
         check_sane(dataclasses.replace(figures, lost=0))
         assert figures.rate is not None and figures.rate < 2000
@@ -100,10 +112,10 @@ def test_every_bridge_gives_sane_figures_on_both_sides(
 
 @needs_mosquitto
 def test_a_link_gives_sane_figures_on_both_devices() -> None:
-    cell = dataclasses.replace(LINKS[1], messages=2500, round_trip=0.02, fleet=MOSQUITTO)
-    row = compare(cell, MOSQUITTO, 0.3, repeats=1)
+    cell = dataclasses.replace(LINKS[1], messages=2500, round_trip=0.02, fleet=PEERS[0])
+    row = compare(cell, PEERS, 0.3, rounds=1)
     assert row.problem is None and row.missing is None
-    for figures in (row.ours, row.peer):
+    for figures in (row.ours, row.figures(row.against)):
         check_sane(dataclasses.replace(figures, rate=figures.messages / figures.seconds))
         assert figures.messages == 2500
         assert figures.beside_us is not None and figures.beside_us < 30_000_000
@@ -112,15 +124,15 @@ def test_a_link_gives_sane_figures_on_both_devices() -> None:
 
 
 def test_a_link_needs_a_broker_of_a_fleet() -> None:
-    assert compare(LINKS[0], None, 0.3).missing == "needs mosquitto as the fleet's broker"
+    assert compare(LINKS[0], [], 0.3).missing == "needs mosquitto as the fleet's broker"
 
 
 def test_conversion_gives_sane_figures_and_both_give_the_same_json() -> None:
     pytest.importorskip("rclpy")
     (cell,) = (cell for cell in CELLS if isinstance(cell, ConversionCell))
-    row = compare(cell, "mosquitto", 0.3, repeats=1)
+    row = compare(cell, [Peer("mosquitto", (2, 1, 0), "mosquitto 2.1.0")], 0.3, rounds=1)
     assert row.problem is None and row.missing is None
-    for figures in (row.ours, row.peer):
+    for figures in (row.ours, row.figures(row.against)):
         assert figures is not None and figures.messages > 0
         assert figures.cpu_us is not None and 0.1 < figures.cpu_us < 10_000
     cdr = conversion.sample()
@@ -135,9 +147,10 @@ def test_every_statement_about_growth_gets_its_figure_from_both_brokers(
     monkeypatch.setattr(growth, "RUNS", 1)
     monkeypatch.setattr(growth, "SETTLE_SECONDS", 0.1)
     size = 40 if cell.name == "growth-clients" else 1000
-    row = grow(dataclasses.replace(cell, size=size), MOSQUITTO, 0.2)
+    row = grow(dataclasses.replace(cell, size=size), PEERS, 0.2)
     assert row.problem is None and row.missing is None
-    for figures in (row.ours, row.peer):
+    assert list(row.peers) == [PEERS[0].name]
+    for figures in (row.ours, *row.peers.values()):
         assert figures is not None
         for statement in cell.statements:
             assert 0 <= figures[statement.figure] < 100_000
@@ -149,66 +162,19 @@ def test_every_statement_about_growth_gets_its_figure_from_both_brokers(
     assert row.reached is not None
 
 
-def test_a_broker_that_ends_is_told_with_its_last_words(tmp_path: Path) -> None:
-    broken = tmp_path / "mosquitto"
-    broken.write_text("#!/bin/sh\necho out of order >&2\nexit 3\n")
-    broken.chmod(0o755)
-    row = compare(CELLS[0], str(broken), 2.0, repeats=1)
-    assert row.problem == "mosquitto does not start; mosquitto ended with 3: out of order"
-    check_sane(row.ours)
-    assert row.peer is None and row.met is None
-
-
-def test_ratios_and_goals() -> None:
-    cell = Cell("c", "a cell", {"cpu_us": 1.5})
-    ours, peer = Result("c", False, 1.0, cpu_us=2.0), Result("c", False, 1.0, cpu_us=3.0)
-    assert Row(cell, ours, peer).ratio("cpu_us") == 1.5
-    assert Row(cell, ours, peer).met is True
-    assert Row(cell, peer, peer).met is False
-    assert Row(cell, ours).met is None
-
-
-def test_goals_of_our_own_figures() -> None:
-    cell = Cell("c", "a cell", {"rate": 1.0}, at_least={"rate": 9.0}, at_most={"p99_us": 5.0})
-    ours = Result("c", False, 1.0, rate=9.0, p99_us=5.0)
-    peer = dataclasses.replace(ours, rate=8.0)
-    assert Row(cell, ours, peer).met is True
-    assert Row(cell, ours).met is None
-    assert Row(cell, ours, dataclasses.replace(peer, rate=9.1)).meets("rate") is False
-    assert Row(cell, dataclasses.replace(ours, rate=8.9), peer).meets("rate") is False
-    assert Row(cell, dataclasses.replace(ours, p99_us=5.1), peer).meets("p99_us") is False
-    assert Row(cell, dataclasses.replace(ours, p99_us=None), peer).met is None
-    assert Row(cell, ours, peer).meets("p50_us") is None
-    assert report.goals(cell, "rate") == "≥ 1, appliance ≥ 9.0"
-    assert report.goals(cell, "p99_us") == "appliance ≤ 5.0"
-
-
-def test_what_is_reached_is_at_most_the_goal() -> None:
-    statements = (Statement("a", "a", "ms", 50.0), Statement("b", "b"), Statement("c", "c", "", 0))
-    cell = GrowthCell("g", "a cell", 7, statements)
-    assert GrowthRow(cell, {"a": 50.0, "b": 1e9, "c": 0}).reached is True
-    assert GrowthRow(cell, {"a": 50.1, "b": 1.0, "c": 0}).reached is False
-    assert GrowthRow(cell, {"a": 1.0, "b": 1.0, "c": 1}).reached is False
-    assert GrowthRow(cell, {"a": 1.0}).reached is None
-    assert GrowthRow(cell).reached is None
-
-
-def test_medians_but_every_loss() -> None:
-    runs = [Result("c", True, 1.0, lost=1, cpu_us=cpu, memory_kib=None) for cpu in (9.0, 1.0, 2.0)]
-    assert median(runs) == Result("c", True, 1.0, lost=3, cpu_us=2.0)
-
-
 # The command
 
 
 @needs_mosquitto
 def test_json_for_machines(capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["qos0-pair"], 0.2, None, True) == 0
+    assert bench.main(["qos0-pair"], 0.2, None, True, rounds=1) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["peer"].startswith("mosquitto ")
+    assert printed["appliance"].startswith("appliance")
+    assert [each["name"] for each in printed["peers"]] == [PEERS[0].name]
     (row,) = printed["rows"]
     assert row["goals"] == {"cpu_us": 1.0}
-    assert row["ratios"]["cpu_us"] == pytest.approx(row["peer"]["cpu_us"] / row["ours"]["cpu_us"])
+    ours, peer = row["ours"]["median"], row["peers"][PEERS[0].name]
+    assert peer["ratios"]["cpu_us"] == pytest.approx(peer["median"]["cpu_us"] / ours["cpu_us"])
     assert row["problem"] is None
 
 
@@ -226,8 +192,10 @@ def test_growth_in_json_for_machines(
     (row,) = printed["growth"]
     assert (row["cell"], row["size"], row["problem"]) == ("growth-clients", 20, None)
     told = {each["figure"]: each for each in row["statements"]}
-    assert told["failed"]["at_most"] == row["ours"]["failed"] == row["peer"]["failed"] == 0
-    assert told["failed"]["reached"] is told["failed"]["reached_by_peer"] is True
+    assert told["failed"]["at_most"] == row["ours"]["failed"] == 0
+    assert row["peers"][PEERS[0].name]["failed"] == 0
+    assert told["failed"]["reached"] is True
+    assert told["failed"]["reached_by_peers"] == {PEERS[0].name: True}
 
 
 @needs_mosquitto
@@ -240,30 +208,38 @@ def test_so_many_messages_wait_as_are_asked_for(capsys: pytest.CaptureFixture[st
 def test_without_a_peer_ours_alone(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command, "find_mosquitto", lambda command: None)
-    assert bench.main(["qos0-pair"], 0.2, None, False) == 0
+    def none() -> Peer:
+        raise PeerError("mosquitto is not among the installed programs")
+
+    monkeypatch.setattr(command, "find_peer", none)
+    assert bench.main(["qos0-pair"], 0.2, None, False, rounds=1) == 0
     captured = capsys.readouterr()
     assert "apt install mosquitto" in captured.err
-    assert "CPU µs a message" in captured.out and "ratio" not in captured.out
+    assert "CPU µs a delivered message" in captured.out and "ratio" not in captured.out
 
 
 @pytest.mark.parametrize(
-    ("cells", "seconds", "peer", "told"),
+    ("cells", "seconds", "peers", "told"),
     [
         (["qos3"], 1.0, None, "no such cell: qos3; there are qos0-pair,"),
         (None, 0.0, None, "must be more than 0"),
-        (None, 1.0, "/no/mosquitto", "/no/mosquitto is not there"),
+        (None, 1.0, ["/no/mosquitto"], "/no/mosquitto is not there"),
     ],
 )
 def test_what_is_wrong_with_the_arguments_is_told(
     cells: list[str] | None,
     seconds: float,
-    peer: str | None,
+    peers: list[str] | None,
     told: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert bench.main(cells, seconds, peer, False) == 2
+    assert bench.main(cells, seconds, peers, False) == 2
     assert told in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_no_round_is_no_measurement(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(None, 1.0, None, False, rounds=0) == 2
+    assert "one round or more" in capsys.readouterr().err
 
 
 @needs_mosquitto
@@ -301,30 +277,6 @@ def test_interrupted_it_leaves_nothing_behind(tmp_path: Path, number: signal.Sig
                 each.kill()
         process.kill()
         process.communicate()
-
-
-def test_the_table_says_what_was_not_reached(capsys: pytest.CaptureFixture[str]) -> None:
-    cell = Cell("c", "a cell", {"cpu_us": 1.5})
-    ours = Result("c", False, 1.0, messages=9, lost=1, cpu_us=3.0, rate=1000.0)
-    peer = dataclasses.replace(ours, lost=0, rate=500.0)
-    statements = (
-        Statement("x", "a ratio", "×", 1.15, "{a-us:.1f} → {b-us:.1f} µs"),
-        Statement("y", "a stop", "ms", 50.0),
-        Statement("z", "a loss", "", 0),
-    )
-    figures = {"x": 1.5, "a-us": 2.0, "b-us": 3.0, "y": 2.0, "z": 0}
-    grown = GrowthRow(GrowthCell("g", "much", 7, statements), figures, problem="mosquitto: gone")
-    report.show([Row(cell, ours, peer)], [grown], "mosquitto 2")
-    lines = capsys.readouterr().out.splitlines()
-    words = [" ".join(line.replace("|", " ").split()) for line in lines]
-    assert "a cell CPU µs a message 3.0 3.0 1.00 ≥ 1.5 not met" in words
-    assert "messages/s 1,000 500 2.00" in words
-    assert "lost by appliance 1 of 10" in words
-    assert "· a ratio 1.50 × (2.0 → 3.0 µs) ≤ 1.15 × not reached" in words
-    assert "· a stop 2.0 ms ≤ 50 ms reached" in words
-    assert "· a loss 0 0 reached" in words
-    assert "mosquitto: gone" in words
-    assert "publish_rate" in " ".join(words)
 
 
 # Links
@@ -419,6 +371,90 @@ def test_a_subscriber_acknowledges_every_identifier_however_the_bytes_are_cut(st
     assert flow.deliveries == len(identifiers)
 
 
+class CutStream:
+    """In a connection's place: gives what it has received in pieces, and keeps what is sent."""
+
+    has_unsent = has_more = False
+
+    def __init__(self, received: bytes, step: int) -> None:
+        self.pieces = [received[start : start + step] for start in range(0, len(received), step)]
+        self.sent = b""
+
+    def recv_into(self, buffer: memoryview) -> int:
+        piece = self.pieces.pop(0)
+        buffer[: len(piece)] = piece
+        return len(piece)
+
+    def send(self, data: memoryview) -> int:
+        self.sent += data[:3]  # a socket that is full takes a part
+        return len(data[:3])
+
+
+def answer(first: int, identifier: int) -> bytes:
+    return bytes([first, 2]) + identifier.to_bytes(2, "big")
+
+
+def exchange(each: LoadPublisher | LoadSubscriber, received: bytes, step: int) -> bytes:
+    """What a client sends after it has received this, cut in pieces."""
+    stream = CutStream(received, step)
+    each.transport = stream  # type: ignore[assignment]
+    while stream.pieces:
+        each.receive()
+    before = None
+    while before != stream.sent:
+        before = stream.sent
+        each.flush()
+    return stream.sent
+
+
+@pytest.mark.parametrize("step", [1, 3, 4, 79, 80, 83, 84, 85, 1000])
+def test_a_subscriber_of_qos_2_answers_each_packet_however_the_bytes_are_cut(step: int) -> None:
+    broker, flow = BrokerEnd(), MessageFlow(Load(qos=2, window=50))
+    publisher = ExactlyOncePublisher(broker.target, "p", flow, "t")
+    subscriber = ExactlyOnceSubscriber(broker.target, "s", flow, "t")
+    flow.start(publisher)
+
+    def publish(identifier: int) -> bytes:
+        return client.publish_packet("t", bytes(64), identifier, qos=2)
+
+    received = [publish(1), publish(0x6262), answer(0x62, 1), publish(65535), answer(0x62, 0x6262)]
+    sent = exchange(subscriber, b"".join(received), step)
+    assert sent == (
+        answer(0x50, 1)
+        + answer(0x50, 0x6262)
+        + answer(0x70, 1)
+        + answer(0x50, 65535)
+        + answer(0x70, 0x6262)
+    )
+    assert flow.deliveries == 3
+    with pytest.raises(LoadError, match="expected PUBLISH or PUBREL, got 0x40"):
+        exchange(subscriber, answer(0x40, 1), step)
+    publisher.close()
+    subscriber.close()
+    broker.listener.close()
+
+
+@pytest.mark.parametrize("step", [1, 2, 3, 4, 5, 7, 1000])
+def test_a_publisher_of_qos_2_releases_what_was_received_and_counts_what_is_complete(
+    step: int,
+) -> None:
+    broker, flow = BrokerEnd(), MessageFlow(Load(qos=2, window=3))
+    publisher = ExactlyOncePublisher(broker.target, "p", flow, "t")
+    flow.start(publisher)
+    flow.deliver(3)
+    received = answer(0x50, 1) + answer(0x50, 2) + answer(0x70, 1) + answer(0x50, 0x7070)
+    sent = exchange(publisher, received, step)
+    releases = [answer(0x62, each) for each in (1, 2, 0x7070)]
+    fourth = client.publish_packet("t", bytes(range(64)), 4, qos=2)
+    assert flow.acknowledged == 1
+    assert len(sent) == len(b"".join(releases)) + len(fourth)
+    assert sent.replace(fourth, b"") == b"".join(releases), "no packet lies inside another"
+    with pytest.raises(LoadError, match="expected PUBREC or PUBCOMP, got 0x40"):
+        exchange(publisher, answer(0x40, 1), step)
+    publisher.close()
+    broker.listener.close()
+
+
 class Recorder:
     """In a publisher's place: what it is told to send."""
 
@@ -458,7 +494,7 @@ def test_each_of_many_topics_has_its_turn_and_the_wildcard_has_all() -> None:
     publisher = LoadPublisher(broker.target, "p", flow, "bench/t")
     publisher.close()
     broker.listener.close()
-    size = len(client.publish_packet(load.topic_of("bench/t", flow.load, 0), bytes(64)))
+    size = len(client.publish_packet(topic_of("bench/t", flow.load, 0), bytes(64)))
     ring = bytes(publisher._ring)
     assert len(ring) % size == 0
     packets = [ring[start : start + size] for start in range(0, len(ring), size)]
@@ -496,7 +532,7 @@ def test_other_subscriptions_are_other_ones() -> None:
     filters = [growth.other_filter(number) for number in range(10_000)]
     assert len(set(filters)) == 10_000
     assert sum("+" in each or "#" in each for each in filters) == 3000
-    published = ["bench/load/00", load.topic_of("bench/load/00", Load(topics=9), 7)]
+    published = ["bench/load/00", topic_of("bench/load/00", Load(topics=9), 7)]
     for each in filters:
         check_filter(each)
         assert not any(matches(each, topic) for topic in published)
