@@ -183,7 +183,7 @@ class Reload:
         rights = parts.access.adopt(read.rules)
         changed += self._take_access(rights)
         if parts.bridge is not None:
-            parts.bridge.home_assistant.use(settings.bridge.home_assistant)
+            parts.bridge.tell_home_assistant(settings.bridge.home_assistant)
             parts.bridge.replace(ros_settings.routes(settings))
             parts.bridge.calls.replace(ros_settings.call_routes(settings))
             parts.bridge.clean_up_retained()

@@ -105,8 +105,8 @@ class Announcements:
         if self._publish("routes", b"[%b]" % b",".join(entries), session):
             self._use_types((*(topic.type for topic, _ in topics), *bridge.calls.types()))
         self._publish("skipped", orjson.dumps(summary(bridge.skips())), session)
-        settings = [(topic, flow.settings) for topic, flow in topics]
-        yield from self._home_assistant.work(settings, calls, session)
+        routed = ((topic, flow.settings) for topic, flow in topics)
+        yield from self._home_assistant.work(routed, calls, session)
         self._broker.flush()
 
     def _publish(self, name: str, payload: bytes, session: Session) -> bool:

@@ -127,10 +127,9 @@ class Bridge:
         self._faults = broker.faults
         self._entries = entries = Entries(loop, broker.faults)
         self._schemas = SchemaTopics(broker, entries, robot, node.describe)
-        #: Whether Home Assistant is told of what is bridged, which a reload changes.
-        self.home_assistant = HomeAssistant(broker, robot, home_assistant)
+        self._home_assistant = HomeAssistant(broker, robot, home_assistant)
         self._announcements = Announcements(
-            broker, entries, robot, self, self._schemas.replace, self.home_assistant
+            broker, entries, robot, self, self._schemas.replace, self._home_assistant
         )
         self._session: Session | None = None
         self._cleanup = RetainedCleanup(broker, entries)
@@ -483,6 +482,12 @@ class Bridge:
         if self._session is not None:
             self._announcements.publish(self._session)
 
+    def tell_home_assistant(self, is_on: bool) -> None:
+        """Tell Home Assistant from now on, or no more; `clean_up_retained` has to follow."""
+        if is_on != self._home_assistant.is_on:
+            self._home_assistant.use(is_on)
+            self._announce()
+
     def _announce_soon(self) -> None:
         """Another client holds a lease, or none does: announce that, with what follows."""
         if self._announce_timer is None and not self._is_stopping:
@@ -511,7 +516,7 @@ class Bridge:
             owners = TopicOwners(
                 [route.settings for route in self._routes],
                 self.calls.routes,
-                self.home_assistant.is_on,
+                self._home_assistant.is_on,
             )
             self._cleanup.start(self._session, owners)
 

@@ -222,7 +222,7 @@ class HomeAssistant:
         return self._is_on
 
     def use(self, is_on: bool) -> None:
-        """From the next announcement on; `retained_cleanup` deletes what is no longer wanted."""
+        """Whether from the next announcement on; `retained_cleanup` deletes what is not wanted."""
         self._is_on = is_on
         self._made_of = None
 
@@ -251,7 +251,7 @@ class HomeAssistant:
         for topic in [*wanted][MOST:]:
             del wanted[topic]
         there = {*(topic.mqtt for topic, _ in topics), *map(_base, services)}
-        self._delete_others(wanted, there, session)
+        yield from self._delete_others(wanted, there, session)
         for count, (topic, (of, payload)) in enumerate(wanted.items(), 1):
             if not count % TURN:
                 yield
@@ -276,18 +276,28 @@ class HomeAssistant:
 
     def _delete_others(
         self, wanted: Mapping[str, object], there: set[str], session: Session
-    ) -> None:
-        """Delete the entities of what is there now that are not wanted: its type is another one."""
+    ) -> Iterator[None]:
+        """Delete the entities of what is there now that are not wanted: its type is another one.
+
+        Others may retain any number of messages there, so they are gone through in steps.
+        """
         retained = self._broker.retained
-        others = [
-            topic
-            for topic, message in retained.find(FILTER)
-            if topic not in wanted
-            and retained.owner(topic).is_inside
-            and bridged_at(message) in there
-        ]
-        for topic in others:
-            self._broker.publish(Message(topic, b"", 0, True), session)
+        others = []
+        for found in retained.find_in_steps(FILTER):
+            if found is None:
+                yield
+                continue
+            topic, message = found
+            # Whose it is comes first: properties of others are not looked through.
+            if (
+                topic not in wanted
+                and retained.owner(topic).is_inside
+                and bridged_at(message) in there
+            ):
+                others.append(topic)
+        for topic in others:  # not while iterating over the retained messages
+            if retained.get(topic) is not None and retained.owner(topic).is_inside:
+                self._broker.publish(Message(topic, b"", 0, True), session)
 
 
 def _base(service: Mapping[str, Any]) -> str:

@@ -381,10 +381,9 @@ async def test_off_and_on_by_a_reload(there: Any) -> None:
     there.node.add_publisher("/x", BOOL)
     await until(lambda: told(there))
     for is_on in (False, True):
-        there.bridge.home_assistant.use(is_on)
+        there.bridge.tell_home_assistant(is_on)
         there.bridge.replace([to_mqtt("/x")])
         there.bridge.clean_up_retained()
-        there.bridge._announce()
         await until(lambda is_on=is_on: bool(told(there)) == is_on)
 
 
@@ -394,8 +393,8 @@ async def test_it_is_switched_off_meanwhile(there: Any, monkeypatch: pytest.Monk
     for name in ("/x", "/y"):
         there.node.add_publisher(name, BOOL)
     await until(lambda: len(there.routes()) == 2)
-    there.bridge.home_assistant.use(True)
-    work = there.bridge.home_assistant.work(
+    there.bridge._home_assistant.use(True)
+    work = there.bridge._home_assistant.work(
         [
             (BridgedTopic(name, f"r2d2{name}", BOOL, "to_mqtt", "json"), to_mqtt(name))
             for name in ("/x", "/y")
@@ -405,7 +404,7 @@ async def test_it_is_switched_off_meanwhile(there: Any, monkeypatch: pytest.Monk
     )
     while not told(there):
         next(work)
-    there.bridge.home_assistant.use(False)
+    there.bridge._home_assistant.use(False)
     there.bridge.clean_up_retained()
     await there.settle()
     assert list(work) == []

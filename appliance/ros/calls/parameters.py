@@ -195,6 +195,8 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
                 async with timeout(READ_TIMEOUT):
                     values = await self._get_all(node)
             except (CallError, ConversionError, asyncio.TimeoutError) as error:
+                if self._is_stopped:  # Python 3.10 loses a cancellation that comes with the timeout
+                    return
                 why = str(error) or "no answer"
                 node.problem = f"its parameters cannot be read: {why}"
                 if not has_failed:
