@@ -38,6 +38,9 @@ ROUND_TRIP = 0.5
 #: Seconds that an attack may overrun.
 LATEST = 1.0
 
+#: Seconds between two looks at the clock while work is waited for.
+LOOK = 0.05
+
 #: Connections that are opened concurrently.
 AT_A_TIME = 32
 
@@ -171,7 +174,12 @@ BOTH = (Over.TLS, Over.PLAIN)
 
 
 class Load:
-    """One attack on one broker for `seconds`; its connections alternate between `ways`."""
+    """One attack on one broker for `seconds`; its connections alternate between `ways`.
+
+    The time counts from the first connection, and again from the first login: on a busy computer it
+    takes seconds to make up what is sent, and to hash the first password, and an attack that is
+    over before it begins shows nothing. Each of these may take `PATIENCE`.
+    """
 
     def __init__(self, target: Target, ways: tuple[Over, ...], seconds: float) -> None:
         self.target = target
@@ -183,6 +191,11 @@ class Load:
         self._context = target.context()
         self._next_way = itertools.cycle(ways)
         self._loop = asyncio.get_running_loop()
+        self._connected = self._joined = False
+        self._end = 0.0
+        self._lasts(PATIENCE)
+
+    def _lasts(self, seconds: float) -> None:
         self._end = self._loop.time() + seconds
 
     @property
@@ -206,6 +219,9 @@ class Load:
         self, over: Over | None = None, *, receive_buffer: int = 0, port: int = 0
     ) -> socket.socket:
         """A TCP connection to one of the listeners; nothing has been sent on it."""
+        if not self._connected:
+            self._connected = True
+            self._lasts(self.seconds)
         port = port or self.target.port_of(over or next(self._next_way))
         sock = socket.socket()
         try:
@@ -264,13 +280,17 @@ class Load:
             OSError: the broker does not accept it.
         """
         line = await self.dial(receive_buffer=receive_buffer)
-        line.send_nowait(packet or self.connect_packet(client_id, version=version, **fields))
-        if not await line.receive(4) or line.first[3]:
-            raise ConnectionError(f"'{client_id}' is not let in: {line.first.hex()}")
-        if not self.counts["logins"]:
-            # The first password is hashed, for seconds where the computer is busy: that is no part
-            # of the attack, which would have nobody to attack with.
-            self._end = self._loop.time() + self.seconds
+        first = not self._joined
+        if first:
+            self._joined = True
+            self._lasts(PATIENCE)
+        try:
+            line.send_nowait(packet or self.connect_packet(client_id, version=version, **fields))
+            if not await line.receive(4) or line.first[3]:
+                raise ConnectionError(f"'{client_id}' is not let in: {line.first.hex()}")
+        finally:
+            if first:
+                self._lasts(self.seconds)
         self.counts["logins"] += 1
         return line
 
@@ -304,8 +324,7 @@ class Load:
     async def together(self, *work: Coroutine[Any, Any, None]) -> None:
         """Run all of these concurrently until the time is over."""
         tasks = [asyncio.ensure_future(one) for one in work]
-        left = max(0.0, self._end - self._loop.time())
-        done, _ = await asyncio.wait(tasks, timeout=left)
+        done = await self.finish(tasks)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -313,6 +332,18 @@ class Load:
             error = None if task.cancelled() else task.exception()
             if error is not None and not isinstance(error, OSError):
                 raise error
+
+    async def finish(
+        self, tasks: list[asyncio.Task[None]], overrun: float = 0.0
+    ) -> set[asyncio.Task[None]]:
+        """Wait until all are done or the time and `overrun` are over; returns those done.
+
+        The end is looked for again and again, because it moves (see the class).
+        """
+        waiting = set(tasks)
+        while waiting and (left := self._end + overrun - self._loop.time()) > 0:
+            _, waiting = await asyncio.wait(waiting, timeout=min(left, LOOK))
+        return set(tasks) - waiting
 
     async def flood(self, line: Line, data: bytes, count: int, what: str) -> None:
         """Send `data`, which counts as `count` of `what`, repeatedly until the time is over."""
@@ -403,11 +434,15 @@ async def _run_attack(
 ) -> tuple[Counter[str], str]:
     load = Load(target, ways, seconds)
     failure = ""
-    try:
-        # The broker may neither answer nor read; the attack ends anyway.
-        await asyncio.wait_for(attack.run(load), seconds + LATEST)
-    except asyncio.TimeoutError:
+    task = asyncio.ensure_future(attack.run(load))
+    # The broker may neither answer nor read; the attack ends anyway.
+    if not await load.finish([task], LATEST):
         load.counts["broken off"] = 1
+        task.cancel()
+    try:
+        await task
+    except asyncio.CancelledError:
+        pass
     except Exception:
         failure = traceback.format_exc()
     load.leave()
