@@ -21,6 +21,7 @@ from pathlib import Path
 
 from appliance.cli.fastdds import DEFAULT as SEGMENT
 from appliance.config import parse_size
+from appliance.host.libraries import machine_of
 from appliance.ops.install import PACKAGED_COMMAND, PACKAGED_UNIT, systemd_version
 from appliance.ops.unit import ENVIRONMENT, VARIABLES, Unit
 from appliance.packaging import completion, manual
@@ -33,6 +34,8 @@ PROJECT = Path(__file__).resolve().parents[2]
 SCRIPTS = Path(__file__).parent / "debian"
 #: The pages that README leads to, beside those of docs/.
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "certs/README.md")
+#: Debian's names for the kinds of computers that executables are made for.
+ARCHITECTURES = {"x86-64": "amd64", "arm64": "arm64"}
 #: What lintian is told to let pass, each with the reason.
 OVERRIDES = Path("/usr/share/lintian/overrides", PACKAGE)
 
@@ -44,8 +47,18 @@ DESCRIPTION = """\
 
 
 def build(command: Path, directory: Path) -> Path:
-    """Build the package of that executable in the directory; returns its path."""
-    architecture = _output_of("dpkg", "--print-architecture")
+    """Build the package of that executable in the directory; returns its path.
+
+    It is for the kind of computer that the executable is for, whichever this one is.
+
+    Raises:
+        UnreadableError: that is no executable, or one for another kind.
+    """
+    machine = machine_of(command)
+    if machine not in ARCHITECTURES:
+        made_for = f"is made for {machine}" if machine else "is no executable of Linux"
+        raise UnreadableError(f"{command} {made_for}; packages are for {', '.join(ARCHITECTURES)}")
+    architecture = ARCHITECTURES[machine]
     release = version("ros-mqtt-appliance").replace(".dev", "~dev").replace("rc", "~rc")
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)

@@ -18,8 +18,9 @@ import typer
 from pages import Page
 
 from appliance.cli import main as cli
-from appliance.packaging import completion, manual
+from appliance.packaging import completion, deb, manual
 from appliance.packaging.commands import Command, Option
+from appliance.packaging.symbols import UnreadableError
 
 PROJECT = Path(__file__).parents[2]
 
@@ -53,6 +54,38 @@ def root(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("root")
     subprocess.run(["dpkg-deb", "--extract", package, root], check=True)
     return root
+
+
+def made_for(machine: int, file: Path) -> Path:
+    """A copy of Debian's `true` that says it is for another kind of computer (ELF, e_machine)."""
+    content = bytearray(Path(installed("true", "coreutils")).read_bytes())
+    content[18:20] = machine.to_bytes(2, "little")
+    file.write_bytes(content)
+    return file
+
+
+def test_the_package_is_for_the_computers_that_its_command_is_for(tmp_path: Path) -> None:
+    built = deb.build(made_for(183, tmp_path / "appliance"), tmp_path)
+    assert built.name.endswith("_arm64.deb")
+    shown = subprocess.run(
+        ["dpkg-deb", "--field", built, "Architecture"], capture_output=True, text=True, check=True
+    )
+    assert shown.stdout == "arm64\n"
+
+
+@pytest.mark.parametrize(
+    ("machine", "said"), [(243, "is made for RISC-V"), (None, "is no executable of Linux")]
+)
+def test_a_command_for_other_computers_is_refused(
+    machine: int | None, said: str, tmp_path: Path
+) -> None:
+    command = tmp_path / "appliance"
+    if machine is None:
+        command.write_text("#!/bin/sh\n")
+    else:
+        made_for(machine, command)
+    with pytest.raises(UnreadableError, match=f"appliance {said}; packages are for x86-64, arm64"):
+        deb.build(command, tmp_path)
 
 
 def commands() -> dict[str, Any]:

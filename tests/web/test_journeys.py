@@ -122,6 +122,10 @@ def test_a_phone_drives(visit: Callable[..., Visit], odometry: Odometry) -> None
         lambda: other.query_selector(told) or page.query_selector(told), "who drives, on one page"
     )
     second.look("phone-6-not-driving")
+    named = '.quiet:has-text("Commanding now: console-alice-")'
+    eventually(
+        lambda: other.query_selector(named) or page.query_selector(named), "whose it is, too"
+    )
     other.mouse.up()
     eventually(lambda: odometry.speed < -SPEED, "the first one drives back")
     visited.look("phone-5-driving")

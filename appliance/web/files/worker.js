@@ -13,9 +13,10 @@ const SURVEY_PACKET = 32 * 1024
 const FOCUS_PACKET = 12 * 1024 * 1024
 const MAX_RATE = '2' // messages a second of each topic in the survey
 const TOKEN = 'appliance-token-' // what each begins with
-// What the client ids of this window begin with: who sees a list of clients sees which belong together.
+// In the client ids of this window: who sees a list of clients sees which belong together.
 // How they end cannot be guessed either: somebody else might have taken the next one.
-const WINDOW = `console-${random()}`
+const WINDOW = random()
+const NAME = 32 // characters of the user's name in them
 const LEAVING = 3000 // ms for the token's end; then the page goes
 const WRONG = [0x86, 0x87] // reason codes of a login that is not accepted
 const LATER = [0x88, 0x89, 0x97, 0x9f] // and of one that may be, with the same password, after a while
@@ -36,10 +37,16 @@ function random() {
   return crypto.getRandomValues(new Uint32Array(1))[0].toString(36)
 }
 
+/** A client id, which is read where it drives: whose it is, of the letters that no rule of access minds. */
+function clientId() {
+  const name = [...(login.user ?? '')].filter((letter) => /[\p{L}\p{N}._-]/u.test(letter))
+  return ['console', name.slice(0, NAME).join(''), WINDOW, random()].filter(Boolean).join('-')
+}
+
 function options(more, packet) {
   return {
     protocolVersion: 5,
-    clientId: `${WINDOW}-${random()}`,
+    clientId: clientId(),
     username: login.user,
     // At each connect, as a client that reconnects keeps what it was made with.
     transformWsUrl: (url, _, client) => {
