@@ -12,6 +12,10 @@ which nobody knows behind a broker:
 
 A request that goes out gets a token of the link's in the same place.
 
+Answers go out with the link's login, which may be allowed more than the caller: a Response Topic
+there must not be one of the robot's own, whose messages would be taken for the robot's, or for
+commands to it. What answers the call itself is excepted (`reset/_reply/...` for `reset/_call`).
+
 Tokens are random, so that who may write below `_upstream` or `_answers` cannot guess one. They end
 `LIFETIME` after the last request with that Response Topic. When there are too many, the oldest of
 the user here who has the most end, so that nobody's requests take away the answers of others.
@@ -24,7 +28,7 @@ from collections.abc import Callable
 from typing import Final
 
 from appliance.mqtt.codec import text_size
-from appliance.mqtt.topics import MAX_TOPIC, check_topic, matches
+from appliance.mqtt.topics import MAX_TOPIC, SubscriptionTree, check_topic
 from appliance.upstream.rules import UpstreamSettings
 
 #: Seconds after which nobody waits for an answer: longer than every timeout of calls.
@@ -36,6 +40,9 @@ MOST_TOKENS: Final = 10_000
 #: The most bytes of memory of the topics that the tokens of a direction stand for; one may have
 #: 256 KiB.
 MOST_BYTES: Final = 8 << 20
+
+#: Levels of a Response Topic: looking for its rules costs time for each.
+MOST_LEVELS: Final = 200
 
 #: The last level of a topic of calls, see docs/conventions.md; a token is one more level.
 _CALLS: Final = ("_call", "_goal", "_cancel")
@@ -130,11 +137,24 @@ class Answers:
     """The Response Topics of one link, both ways. Times in seconds of any clock."""
 
     def __init__(self, settings: UpstreamSettings, new: Callable[[], str] = new_token) -> None:
-        self._settings = settings
+        self.use(settings)
         self._here = settings.answers_here
         self._there = settings.answers_there
         self._coming = _Tokens(new)
         self._going = _Tokens(new)
+
+    def use(self, settings: UpstreamSettings) -> None:
+        """Go on with the rules of a link that was loaded again; its answer topics are the same."""
+        self._prefix = settings.prefix
+        #: The filters there of what is the robot's own: its state, and all that a rule carries.
+        self._own: SubscriptionTree[None] = SubscriptionTree()
+        rules = (*settings.out, *settings.inward)
+        for filter in (
+            settings.state_there,
+            f"{settings.answers_there}#",
+            *(rule.remote_filter for rule in rules),
+        ):
+            self._own.add(filter, None, None)
 
     def __len__(self) -> int:
         """The tokens in use, of both directions."""
@@ -147,24 +167,32 @@ class Answers:
         or the Response Topic is none that a client may publish to, or one of the robot's own.
         """
         wanted = reply_topic(topic) if response_topic is None else response_topic
-        if wanted is None or not _may_be_answered(wanted) or self._is_the_robots(wanted):
+        if wanted is None or not _may_be_answered(wanted):
+            return None
+        if not self._is_answer_of(topic, wanted) and self._is_the_robots(wanted):
             return None
         return self._here + self._coming.issue(wanted, now)
 
+    @staticmethod
+    def _is_answer_of(called: str, topic: str) -> bool:
+        """Whether calls of that topic there, with or without a token, are answered at the other."""
+        if not _is_call(called):
+            called = called.rpartition("/")[0]
+        return _is_call(called) and topic.startswith(f"{called.rpartition('/')[0]}/_reply/")
+
     def _is_the_robots(self, topic: str) -> bool:
-        """Whether an answer at a topic there would be taken for a message of the robot, or for a
-        command to it: the fleet's broker lets the robot publish it, and perhaps not the caller."""
-        settings = self._settings
-        if topic == settings.state_there or topic.startswith(settings.answers_there):
+        """Whether an answer at a topic there would be taken for a message of the robot, for a
+        command to it, or for the answer of another call of it."""
+        if topic.startswith(self._prefix) and "/_reply/" in topic:
             return True
-        if "/_reply/" in topic:  # which are for answers, also below a rule for everything
-            return False
-        rules = (*settings.out, *settings.inward)
-        return any(matches(rule.remote_filter, topic) for rule in rules)
+        return bool(self._own.match(topic))
 
     def for_answer_out(self, topic: str, now: float) -> str | None:
         """The topic there of an answer that was published here; None when it is for nobody."""
-        return self._topic(self._coming, self._here, topic, now)
+        found = self._topic(self._coming, self._here, topic, now)
+        if found is None or "/_reply/" in found:
+            return found
+        return None if self._is_the_robots(found) else found  # by rules that came after the call
 
     def for_request_out(self, response_topic: str, now: float, user: str | None) -> str | None:
         """The Response Topic there of a user's request that goes out; None when it is invalid.
@@ -236,4 +264,4 @@ def _may_be_answered(topic: str) -> bool:
         check_topic(topic)
     except ValueError:
         return False
-    return topic[0] != "$"
+    return topic[0] != "$" and topic.count("/") < MOST_LEVELS

@@ -93,6 +93,7 @@ class Uplink:
         self._answers = Answers(settings)
         if before is not None and before._answer_topics == self._answer_topics:
             self._answers = before._answers
+            self._answers.use(settings)
         self._journal_clock = parts.backlogs.journal(settings.name, 0).now
         limits = KINDS[settings.kind]
         rate, size = limits.rates(settings.rate, settings.bytes_per_second)

@@ -11,6 +11,7 @@ import pytest
 from appliance.upstream.answers import (
     LIFETIME,
     MOST_BYTES,
+    MOST_LEVELS,
     MOST_TOKENS,
     Answers,
     new_token,
@@ -40,11 +41,43 @@ def test_a_request_from_there_is_answered_there(answers: Answers) -> None:
 def test_an_answer_is_not_taken_for_a_message_of_the_robot() -> None:
     """Who may only call cannot make the robot say that it is online, or command it."""
     answers = Answers(link('out: [{topic: "events/#"}], in: [{topic: cmd_vel}]'))
-    for topic in ("_appliance/state", "_answers/0", "events/alarm", "cmd_vel"):
+    for topic in ("_appliance/state", "_answers/0", "events/alarm", "cmd_vel", "events/_reply/a"):
         assert answers.for_request_in("x", f"fleet/r2/{topic}", 0.0) is None, topic
     assert len(answers) == 0
-    for topic in ("r2/reset/_reply/alice/1", "r2/events/_reply/alice", "r2/other", "r3/events/x"):
+    for topic in ("r2/other", "r3/events/x", "r3/arm/_reply/1"):
         assert answers.for_request_in("x", f"fleet/{topic}", 0.0), topic
+
+
+def test_an_answer_is_not_taken_for_that_of_another_call() -> None:
+    """Who may call one service cannot say what another one has answered to somebody else."""
+    answers = Answers(link('out: [{topic: "#"}], in: [{topic: get/_call}, {topic: get/_call/+}]'))
+    for call in ("fleet/r2/get/_call", "fleet/r2/get/_call/7"):
+        for other in ("arm/_reply/42", "_reply/42", "get/_replying/1", "get/x/_reply/1"):
+            assert answers.for_request_in(call, f"fleet/r2/{other}", 0.0) is None, other
+        assert answers.for_request_in(call, "fleet/r2/get/_reply/alice/1", 0.0)
+    # It is a call of none of the robot's services.
+    assert answers.for_request_in("fleet/r2/get", "fleet/r2/get/_reply/1", 0.0) is None
+
+
+def test_rules_that_came_later_hold_for_answers_too() -> None:
+    answers = Answers(link("in: [{topic: reset/_call}]"))
+    here = [
+        answers.for_request_in("fleet/r2/reset/_call", topic, 0.0)
+        for topic in ("fleet/r2/state", "fleet/r2/reset/_reply/1", "answers/alice")
+    ]
+    assert all(here)
+    answers.use(link('in: [{topic: reset/_call}], out: [{topic: "#"}]'))
+    assert answers.for_request_in("fleet/r2/reset/_call", "fleet/r2/state", 0.0) is None
+    there = [answers.for_answer_out(topic or "", 0.0) for topic in here]
+    assert there == [None, "fleet/r2/reset/_reply/1", "answers/alice"]
+
+
+def test_a_response_topic_of_slashes_costs_nothing(answers: Answers) -> None:
+    deep = "/" * (MOST_LEVELS - 1)
+    assert answers.for_request_in("x", deep, 0.0)
+    for topic in (deep + "/", "/" * 60_000):
+        assert answers.for_request_in("x", topic, 0.0) is None
+        assert answers.for_request_out(topic, 0.0, "bob") is None
 
 
 def test_a_request_from_here_is_answered_here(answers: Answers) -> None:
