@@ -206,8 +206,6 @@ class App:
         )
         self._stack.push_async_callback(listeners.stop)
         self._inside = broker.attach("_appliance", InsideLink())
-        for topic in orphaned_topics(broker.retained, settings):
-            self._publish(topic, b"", retain=True)
         self._pulse = Pulse(broker, listeners.scheduler, self._inside, loop.time)
         self._tls, self._store = tls, store
         self._login, self._access = login, access
@@ -217,6 +215,8 @@ class App:
         # Before the listeners start, and stopped after them: whatever a client is acknowledged is
         # offered to the links.
         self._start_upstreams(store)
+        for topic in orphaned_topics(broker.retained, settings):  # the links tell of it, too
+            self._publish(topic, b"", retain=True)
         if plugins is None:
             await listen()
             self._stack.push_async_callback(listeners.stop)

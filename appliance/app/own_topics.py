@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from appliance.broker.retained import RetainedMessages
 from appliance.config import Settings
-from appliance.ros.home_assistant import FILTER, bridged_at
+from appliance.ros.home_assistant import FILTER, shown_by
 
 
 def orphaned_topics(retained: RetainedMessages, settings: Settings) -> list[str]:
@@ -32,6 +32,6 @@ def orphaned_topics(retained: RetainedMessages, settings: Settings) -> list[str]
         orphaned += [
             topic
             for topic, message in retained.find(FILTER)
-            if retained.owner(topic).is_inside and bridged_at(message) is not None
+            if retained.owner(topic).is_inside and shown_by(message) is not None
         ]
     return orphaned

@@ -215,6 +215,7 @@ class Bridge:
         }
         self._receive_for(wanted)
         self._routes = wanted
+        self._home_assistant.routes_change()
         named = {key: flow for key, flow in self._to_ros.items() if not flow.is_matched}
         self._follower.follow(
             TopicRoutes(tuple(wanted), MappingProxyType(self._named), MappingProxyType(named))
@@ -483,10 +484,8 @@ class Bridge:
             self._announcements.publish(self._session)
 
     def tell_home_assistant(self, is_on: bool) -> None:
-        """Tell Home Assistant from now on, or no more; `clean_up_retained` has to follow."""
-        if is_on != self._home_assistant.is_on:
-            self._home_assistant.use(is_on)
-            self._announce()
+        """Tell Home Assistant from the next routes on, or no more: `replace` has to follow."""
+        self._home_assistant.use(is_on)
 
     def _announce_soon(self) -> None:
         """Another client holds a lease, or none does: announce that, with what follows."""
@@ -538,7 +537,10 @@ class Bridge:
 
     def on_routes_followed(self) -> None:
         """New routes are in effect: flows of old ones publish nothing any more."""
+        self._home_assistant.routes_followed()
         self.clean_up_retained()
+        if self._home_assistant.is_on:
+            self._announce()
 
     def on_matched(self, flows: list[ToRos]) -> None:
         """Receive for these flows to ROS, whose topics were found by patterns."""

@@ -36,8 +36,8 @@ PREFIX: Final = "homeassistant"
 #: The topics of entities.
 FILTER: Final = f"{PREFIX}/+/+/+/config"
 
-#: Entities that are published: a robot may have thousands of topics, and Home Assistant
-#: subscribes to each.
+#: Entities that are retained, those of topics that are away included: a robot may have thousands
+#: of topics, or change their names, and Home Assistant subscribes to each.
 MOST: Final = 1000
 
 #: Entities that are made in one turn of the event loop: less than a millisecond.
@@ -45,6 +45,10 @@ TURN: Final = 25
 
 #: The user property that names the topic of the route that an entity is for.
 _OF: Final = "bridged-at"
+
+#: Names as ROS 2 allows them; the Master of ROS 1 takes any.
+_NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+_LONGEST_NAME: Final = 247
 
 #: The end of the topic of calls: Home Assistant sends no Response Topic, see docs/calls.md.
 _CALLER: Final = "homeassistant"
@@ -110,7 +114,9 @@ _READINGS: Final[Mapping[str, tuple[_Reading, ...]]] = {
         _Reading(
             "device_tracker",
             ("latitude", "longitude"),
-            "{{ {'latitude': value_json.latitude, 'longitude': value_json.longitude} | tojson }}",
+            # Without a fix it stays where it was last.
+            "{{ {'latitude': value_json.latitude, 'longitude': value_json.longitude} | tojson "
+            "if value_json.latitude is number and value_json.longitude is number else '{}' }}",
             {"source_type": "gps"},
         ),
     ),
@@ -122,7 +128,8 @@ _READINGS: Final[Mapping[str, tuple[_Reading, ...]]] = {
         _Reading(
             "binary_sensor",
             ("status",),
-            "{{ 'ON' if value_json.status | selectattr('level', 'ge', 2) | list else '' }}",
+            "{{ 'ON' if value_json.status | selectattr('level', 'ge', 2) | list "
+            "else 'OFF' if this is defined and this.state == 'unknown' else '' }}",
             {
                 "device_class": "problem",
                 "entity_category": "diagnostic",
@@ -155,15 +162,26 @@ _SERVICES: Final[Mapping[str, tuple[str, Mapping[str, object]]]] = {
     "std_srvs/Empty": ("button", {"payload_press": "{}"}),
 }
 
+#: The components of services; all others are those of topics.
+_OF_SERVICES: Final = frozenset(component for component, _ in _SERVICES.values())
+
 #: Encodings whose payload is a picture, and the type of the message where it has to be one.
 _PICTURES: Final = {"jpeg": None, "png": None, "binary": "sensor_msgs/CompressedImage"}
+
+
+class Shown(NamedTuple):
+    """What an entity is for: a service or a topic to MQTT, and the topic of its route. Both may
+    have the same."""
+
+    is_service: bool
+    topic: str
 
 
 def entities_of_topic(
     robot: str, topic: BridgedTopic, settings: TopicSettings
 ) -> Iterator[tuple[str, dict[str, object]]]:
     """The topic and the configuration of each entity that shows something of a bridged topic."""
-    if topic.direction != "to_mqtt" or settings.compression != "none":
+    if topic.direction != "to_mqtt" or settings.compression != "none" or not _is_name(topic.ros):
         return
     kind = _without_kind(topic.type)
     if topic.encoding in _PICTURES:
@@ -191,18 +209,21 @@ def entities_of_call(
     found = _SERVICES.get(_without_kind(call["type"]))
     if call["direction"] != "service" or call["encoding"] != "json" or found is None:
         return
+    if not _is_name(call["ros"]):
+        return
     component, extra = found
     command = {"command_topic": f"{call['mqtt']}/{_CALLER}", "qos": 1, **extra}
     yield _entity(robot, component, call["ros"], "", command)
 
 
-def bridged_at(message: Message) -> str | None:
-    """The topic of the route that a retained message is an entity of; None if it is none."""
-    if not message.topic.startswith(f"{PREFIX}/"):
+def shown_by(message: Message) -> Shown | None:
+    """What a retained message is an entity of; None if it is none."""
+    prefix, _, rest = message.topic.partition("/")
+    if prefix != PREFIX:
         return None
     pairs = (message.properties or {}).get(Property.USER_PROPERTY, [])
-    found = dict(cast("list[tuple[str, str]]", pairs))
-    return found.get(_OF)
+    topic = dict(cast("list[tuple[str, str]]", pairs)).get(_OF)
+    return None if topic is None else Shown(rest.partition("/")[0] in _OF_SERVICES, topic)
 
 
 class HomeAssistant:
@@ -214,6 +235,9 @@ class HomeAssistant:
         self._is_on = is_on
         #: What the entities were made of that were published last.
         self._made_of: object = None
+        #: Counts changes of what is wanted: what was being published then is outdated.
+        self._changes = 0
+        self._is_following = False
         self._has_told = False
 
     @property
@@ -223,8 +247,19 @@ class HomeAssistant:
 
     def use(self, is_on: bool) -> None:
         """Whether from the next announcement on; `retained_cleanup` deletes what is not wanted."""
-        self._is_on = is_on
-        self._made_of = None
+        if is_on != self._is_on:
+            self._is_on = is_on
+            self._changes += 1
+            self._made_of = None
+
+    def routes_change(self) -> None:
+        """Routes were replaced: tell nothing of what is bridged until it is by the new ones."""
+        self._is_following = True
+        self._changes += 1
+
+    def routes_followed(self) -> None:
+        """What is bridged is by the new routes now."""
+        self._is_following = False
 
     def work(
         self,
@@ -233,13 +268,14 @@ class HomeAssistant:
         session: Session,
     ) -> Iterator[None]:
         """Publish the entities of all that is bridged where they have changed, turn by turn."""
-        if not self._is_on:
+        if not self._is_on or self._is_following:
             return
         topics = list(topics)
         services = [call for call in calls if call["direction"] == "service"]
         made_of = (topics, services)
         if made_of == self._made_of:
             return
+        changes = self._changes
         wanted: dict[str, tuple[str, bytes]] = {}
         for count, (of, topic, config) in enumerate(self._entities(topics, services), 1):
             wanted[topic] = of, orjson.dumps(config)
@@ -250,17 +286,28 @@ class HomeAssistant:
             log.warning("Home Assistant is told of %d entities of %d", MOST, len(wanted))
         for topic in [*wanted][MOST:]:
             del wanted[topic]
-        there = {*(topic.mqtt for topic, _ in topics), *map(_base, services)}
+        there = {Shown(False, topic.mqtt) for topic, _ in topics if topic.direction == "to_mqtt"}
+        there |= {Shown(True, _base(service)) for service in services}
         yield from self._delete_others(wanted, there, session)
+        is_all = True
         for count, (topic, (of, payload)) in enumerate(wanted.items(), 1):
             if not count % TURN:
                 yield
-            if not self._is_on:  # meanwhile: what there was is deleted already
+            if changes != self._changes:  # what there was may be deleted already
                 return
-            before = self._broker.retained.get(topic)
-            if before is None or before.payload != payload:
-                self._broker.publish(Message(topic, payload, 0, True, _properties(of)), session)
-        self._made_of = made_of
+            is_all &= self._tell(topic, of, payload, session)
+        # What there was no room for is tried again, with the next announcement.
+        self._made_of = made_of if is_all else None
+
+    def _tell(self, topic: str, of: str, payload: bytes, session: Session) -> bool:
+        """Retain an entity, unless it is; returns whether it is now."""
+        retained = self._broker.retained
+        before = retained.get(topic)
+        # Somebody else's with the same payload would not be deleted with the route.
+        if before is not None and before.payload == payload and retained.owner(topic).is_inside:
+            return True
+        message = Message(topic, payload, 0, True, _properties(of))
+        return self._broker.publish(message, session) < 0x80
 
     def _entities(
         self,
@@ -275,26 +322,27 @@ class HomeAssistant:
                 yield _base(service), topic, config
 
     def _delete_others(
-        self, wanted: Mapping[str, object], there: set[str], session: Session
+        self, wanted: Mapping[str, object], there: set[Shown], session: Session
     ) -> Iterator[None]:
         """Delete the entities of what is there now that are not wanted: its type is another one.
 
-        Others may retain any number of messages there, so they are gone through in steps.
+        What is away keeps its entities, as long as there are not too many. Others may retain any
+        number of messages there, so they are gone through in steps.
         """
         retained = self._broker.retained
-        others = []
+        others, away = [], []
         for found in retained.find_in_steps(FILTER):
             if found is None:
                 yield
                 continue
             topic, message = found
             # Whose it is comes first: properties of others are not looked through.
-            if (
-                topic not in wanted
-                and retained.owner(topic).is_inside
-                and bridged_at(message) in there
-            ):
-                others.append(topic)
+            if topic in wanted or not retained.owner(topic).is_inside:
+                continue
+            shown = shown_by(message)
+            if shown is not None:
+                (others if shown in there else away).append(topic)
+        others += away[: max(0, len(wanted) + len(away) - MOST)]
         for topic in others:  # not while iterating over the retained messages
             if retained.get(topic) is not None and retained.owner(topic).is_inside:
                 self._broker.publish(Message(topic, b"", 0, True), session)
@@ -318,6 +366,10 @@ def _without_kind(type_name: str) -> str:
     return f"{package}/{rest.rpartition('/')[2]}"
 
 
+def _is_name(ros: str) -> bool:
+    return len(ros) <= _LONGEST_NAME and _NAME.fullmatch(ros) is not None
+
+
 def _are_in(fields: tuple[str, ...], needs: tuple[str, ...]) -> bool:
     """Whether a route with these `fields` carries all that is needed."""
     return not fields or all(
@@ -334,7 +386,7 @@ def _entity(
     names have two ids.
     """
     name = ros.strip("/")
-    id_ = re.sub(r"[^A-Za-z0-9_-]", "_", name.replace("/", "-")) + (f"--{part}" if part else "")
+    id_ = name.replace("/", "-") + (f"--{part}" if part else "")
     node = robot.replace(".", "--")
     config = {
         "name": f"{name} {part}".strip(),

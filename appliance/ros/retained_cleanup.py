@@ -12,7 +12,7 @@ from appliance.broker.session import Session
 from appliance.mqtt.codec import Property
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.routes import CallRoutes
-from appliance.ros.home_assistant import bridged_at
+from appliance.ros.home_assistant import Shown, shown_by
 from appliance.ros.patterns import Names
 from appliance.ros.topics.route import TopicSettings
 
@@ -48,11 +48,15 @@ class TopicOwners:
         self._parameters = [
             (_Template(route.mqtt, "{node}"), Names(route.names)) for route in calls.parameters
         ]
-        self._entities: list[_Template] = []
+        #: Of what Home Assistant has entities, by whether it is a service.
+        self._shown: dict[bool, list[_Template]] = {False: [], True: []}
         if home_assistant:
-            shown = [(route.mqtt, route.names) for route in routes if route.to != "ros"]
-            called = [(route.mqtt, route.names) for route in calls.services]
-            self._entities = [_Template(mqtt, "{ros}", names) for mqtt, names in shown + called]
+            self._shown = {
+                False: [_Template(r.mqtt, "{ros}", r.names) for r in routes if r.to != "ros"],
+                True: [
+                    _Template(r.mqtt, "{ros}", r.names) for r in calls.services if r.to == "ros"
+                ],
+            }
 
     def has(self, topic: str) -> bool:
         """Whether it may be the topic of a route, whether or not its ROS node is there."""
@@ -68,9 +72,9 @@ class TopicOwners:
                 return True
         return False
 
-    def has_entity(self, of: str) -> bool:
-        """Whether Home Assistant has an entity of a route with this topic."""
-        return any(template.name(of) is not None for template in self._entities)
+    def has_entity(self, shown: Shown) -> bool:
+        """Whether Home Assistant may have an entity of it."""
+        return any(each.name(shown.topic) is not None for each in self._shown[shown.is_service])
 
 
 class RetainedCleanup:
@@ -112,9 +116,9 @@ class RetainedCleanup:
             topic, message = found
             if not retained.owner(topic).is_inside:
                 continue
-            entity_of = bridged_at(message)
-            if entity_of is not None:
-                is_orphan = not owners.has_entity(entity_of)
+            shown = shown_by(message)
+            if shown is not None:
+                is_orphan = not owners.has_entity(shown)
             else:
                 is_orphan = is_of_route(message) and not owners.has(topic)
             if is_orphan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,15 @@ def here(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def found(here: Path, bridge: dict[str, Any] | None = None, **broker: Any) -> list[Finding]:
+def found(
+    here: Path,
+    bridge: dict[str, Any] | None = None,
+    upstreams: Sequence[dict[str, Any]] = (),
+    **broker: Any,
+) -> list[Finding]:
     said = {
         "robot": "r2",
+        "upstreams": [*upstreams],
         "broker": broker,
         "bridge": {"discovery": "localhost", **(bridge or {})},
     }
@@ -344,5 +351,15 @@ def test_who_may_read_what_home_assistant_is_told(here: Path) -> None:
         for each in found(here, {"home_assistant": True})
         if each.subject == "bridge.home_assistant"
     ]
-    assert (may.level, may.text) == ("ok", "alice may read homeassistant/#")
+    assert (may.level, may.text) == ("ok", "alice may read of homeassistant/#")
     assert "homeassistant" not in str(found(here))
+
+
+def test_a_link_may_read_what_home_assistant_is_told(here: Path) -> None:
+    """Where Home Assistant has a broker of its own, nobody here reads it but the link's user."""
+    (here / "acl.conf").write_text("user link\ntopic read homeassistant/sensor/#\n")
+    link = {"name": "home", "servers": ["mqtts://home"], "user": "link", "prefix": "r2/"}
+    told = found(here, {"home_assistant": True}, upstreams=[link])
+    assert [each.text for each in told if each.subject == "bridge.home_assistant"] == [
+        "link may read of homeassistant/#"
+    ]

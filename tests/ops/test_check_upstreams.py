@@ -432,3 +432,11 @@ def test_a_rule_that_sends_less_than_comes_and_keeps_the_rest(
         "all that is not sent waits, longer and longer; add: keep: latest"
     )
     assert told == ([expected] if is_told else [])
+
+
+def test_a_slower_rule_behind_one_for_a_part(here: Path) -> None:
+    with (here / "acl.conf").open("a") as file:
+        file.write("topic read {robot}/#\n")
+    bridge = {"topics": [{"ros": "/**", "to": "mqtt", "rate": 10}]}
+    told = troubles(here, bridge=bridge, out=[{"topic": "battery"}, {"topic": "#", "rate": 2}])
+    assert len(told) == 1 and "out #: rate 2 is less than the 10 a second" in told[0]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+from dataclasses import replace
 from typing import Any
 
 import jinja2
 import jsonschema
+import orjson
 import pytest
 from bridge_harness import Harness, to_mqtt, to_ros
 from call_harness import AllTypes, call_routes, service
@@ -135,11 +137,12 @@ def entities(ros: str, type_name: str, **options: Any) -> dict[str, dict[str, An
     return found
 
 
-def rendered(config: dict[str, Any], payload: bytes) -> str:
-    """What Home Assistant shows after a message: `value_json` is there where it is JSON."""
+def rendered(config: dict[str, Any], payload: bytes, **this: str) -> str:
+    """What Home Assistant shows after a message: `value_json` is there where it is JSON, and `this`
+    where the entity has been added."""
     template = config.get("value_template") or config["json_attributes_template"]
     value = payload.decode()
-    names: dict[str, Any] = {"value": value}
+    names: dict[str, Any] = {"value": value, **({"this": this} if this else {})}
     with contextlib.suppress(ValueError):
         names["value_json"] = json.loads(value)
     return jinja2.Environment(autoescape=False).from_string(template).render(names)
@@ -217,6 +220,7 @@ async def shown(harness: Harness, ros: str, type_name: str, **fields: Any) -> di
             {"latitude": 48.5, "longitude": 9.25},
             {"x": '{"latitude": 48.5, "longitude": 9.25}'},
         ),
+        ("sensor_msgs/msg/NavSatFix", {"latitude": float("nan")}, {"x": "{}"}),  # no fix
         (BOOL, {"data": True}, {"x": "ON"}),
         (BOOL, {"data": False}, {"x": "OFF"}),
         ("std_msgs/msg/Int64", {"data": -(1 << 53) - 1}, {"x": "-9007199254740993"}),
@@ -238,6 +242,11 @@ async def test_diagnostics(there: Any, level: int, array: str, status: str) -> N
     assert names == {"top": status}
     found = await shown(there, "/all", "diagnostic_msgs/msg/DiagnosticArray", status=[one])
     assert found == {"all": array}
+    # Its state when Home Assistant has heard of none; `this` is the entity.
+    (config,) = entities("/all", "diagnostic_msgs/msg/DiagnosticArray").values()
+    payload = there.client.payloads("r2d2/all")[-1]
+    assert rendered(config, payload, state="unknown") == (array or "OFF")
+    assert rendered(config, payload, state="on") == array
 
 
 @pytest.mark.parametrize(
@@ -293,6 +302,14 @@ def test_names_of_robots(robot: str) -> None:
     bridged = BridgedTopic("/x", f"{robot}/x", BOOL, "to_mqtt", "json")
     ((topic, _),) = entities_of_topic(robot, bridged, to_mqtt("/x"))
     assert topic.split("/")[2].replace("_", "").replace("-", "").isalnum()
+
+
+@pytest.mark.parametrize("ros", ["/a-b", "/a b", "x", "/", "/a//b", "/1a", "/" + "x" * 247])
+def test_names_that_ros_2_does_not_allow_have_none(ros: str) -> None:
+    """The Master of ROS 1 takes any; two of them could have one id, or a topic that is too long."""
+    bridged = BridgedTopic(ros, f"r2d2{ros}", BOOL, "to_mqtt", "json")
+    assert not list(entities_of_topic("r2d2", bridged, to_mqtt("/x")))
+    assert not list(entities_of_call("r2d2", call("std_srvs/srv/Trigger", ros=ros)))
 
 
 def call(type_name: str, **other: Any) -> dict[str, Any]:
@@ -384,6 +401,7 @@ async def test_off_and_on_by_a_reload(there: Any) -> None:
         there.bridge.tell_home_assistant(is_on)
         there.bridge.replace([to_mqtt("/x")])
         there.bridge.clean_up_retained()
+        there.node.spin()
         await until(lambda is_on=is_on: bool(told(there)) == is_on)
 
 
@@ -445,3 +463,94 @@ async def test_there_is_a_limit(
     there.bridge._announce()
     await until(lambda: "told of 3 entities of 7" in caplog.text)
     assert len(told(there)) == 3
+
+
+async def test_those_of_topics_that_are_away_count_too(
+    there: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node that changes the names of its topics does not fill what may be retained."""
+    monkeypatch.setattr(home_assistant, "MOST", 3)
+    there.start(to_mqtt("/**"))
+    for number in range(7):
+        publisher = there.node.add_publisher(f"/x{number}", BOOL)
+        name = f"binary_sensor/r2d2/x{number}"
+        await until(lambda name=name: name in told(there), name)
+        assert len(told(there)) == min(number + 1, 3)
+        publisher.remove()
+        await until(lambda: not there.routes())
+
+
+async def test_both_ways_and_a_service_of_the_same_name(there: Any) -> None:
+    """What is away keeps its entities, although something else with its topic is there."""
+    both = [replace(to_mqtt("/light"), to="both", type=BOOL)]
+    light = there.node.add_service("/light", "std_srvs/srv/SetBool", _answer_set_bool)
+    there.start(*both, calls=call_routes(service("/light", type="std_srvs/srv/SetBool")))
+    publisher = there.node.add_publisher("/light", BOOL)
+    wanted = {"binary_sensor/r2d2/light", "switch/r2d2/light"}
+    await until(lambda: {*told(there)} == wanted, "both")
+    publisher.remove()
+    light.remove()
+    there.node.spin()
+    for _ in range(3):
+        there.bridge._announce()
+        await there.settle()
+    assert {*told(there)} == wanted
+    # Without its route the switch goes, and what else has the topic keeps its own.
+    there.bridge.replace(both)
+    there.bridge.calls.replace(call_routes())
+    there.bridge.clean_up_retained()
+    there.node.spin()
+    await until(lambda: [*told(there)] == ["binary_sensor/r2d2/light"])
+
+
+async def test_a_removed_route_is_not_told_of_behind_its_cleanup(
+    there: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(home_assistant, "TURN", 1)
+    there.start(to_mqtt("/x"), to_mqtt("/y"), on=False)
+    for name in ("/x", "/y"):
+        there.node.add_publisher(name, BOOL)
+    await until(lambda: len(there.routes()) == 2)
+    there.bridge.tell_home_assistant(True)
+    topics = [
+        (BridgedTopic(name, f"r2d2{name}", BOOL, "to_mqtt", "json"), to_mqtt(name))
+        for name in ("/x", "/y")
+    ]
+    work = there.bridge._home_assistant.work(topics, [], there.bridge._session)
+    while not told(there):
+        next(work)
+    there.bridge.replace([to_mqtt("/x")])
+    assert list(work) == []
+    # Nor by another announcement, until the new routes are followed.
+    assert list(there.bridge._home_assistant.work(topics, [], there.bridge._session)) == []
+    assert [*told(there)] == ["binary_sensor/r2d2/x"]
+
+
+async def test_what_could_not_be_retained_is_told_again(
+    there: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish = there.broker.publish
+
+    def refuse(message: Message, session: Any) -> int:
+        is_entity = message.topic.startswith("homeassistant/")
+        return 0x97 if is_entity else publish(message, session)
+
+    monkeypatch.setattr(there.broker, "publish", refuse)
+    there.start(to_mqtt("/x"))
+    there.node.add_publisher("/x", BOOL)
+    await until(lambda: there.routes(), "what is bridged")
+    await there.settle()
+    monkeypatch.undo()
+    there.bridge._announce()
+    await until(lambda: told(there), "the entity")
+
+
+async def test_a_users_copy_is_replaced_by_its_own(there: Any) -> None:
+    """Else nothing would delete it with the route."""
+    topic, config = next(iter(entities("/x", BOOL).items()))
+    alice = there.broker.accounting.accounts.of_user("alice")
+    copy = Message(topic, orjson.dumps(config), 1, True)
+    there.broker.retained.keep(copy, alice)
+    there.start(to_mqtt("/x"))
+    there.node.add_publisher("/x", BOOL)
+    await until(lambda: there.broker.retained.owner(topic).is_inside, "its own")

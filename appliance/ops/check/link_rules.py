@@ -212,4 +212,5 @@ def _slower_than_its_routes(settings: Settings, link: UpstreamSettings) -> Itera
                         f"second of the route {route.names[0]}, and with QoS 1 all that is not "
                         "sent waits, longer and longer; add: keep: latest"
                     )
-                break
+                if all(covers(out.local_filter, each) for each in topics):
+                    break

@@ -31,7 +31,10 @@ def rights(settings: Settings, acl: Acl, users: list[str] | None) -> Iterator[Fi
             if not (route.is_exclusion or route.is_pattern) and route.to != "mqtt":
                 yield _writers(acl, users, route.names[0], route.topic(settings.robot), settings)
         if settings.bridge.home_assistant and settings.bridge.bus != "none":
-            yield _told(acl, users, f"{PREFIX}/#", settings)
+            links = [
+                link.user for link in settings.upstreams
+            ]  # Home Assistant's broker may be there
+            yield _told(acl, [*users, *links], f"{PREFIX}/#", settings)
 
 
 def _mistake(rule: Rule) -> str:
@@ -68,9 +71,9 @@ def _writers(acl: Acl, users: list[str], ros: str, topic: str, settings: Setting
 
 def _told(acl: Acl, users: list[str], topics: str, settings: Settings) -> Finding:
     """Who may read what Home Assistant is told."""
-    may = [name for name in users if acl.decide(Identity(name, name), Action.SUBSCRIBE, topics)]
+    may = [name for name in users if acl.allows_some(Identity(name, name), Action.RECEIVE, topics)]
     if may:
-        return Finding("ok", "bridge.home_assistant", f"{_named(may)} may read {topics}")
+        return Finding("ok", "bridge.home_assistant", f"{_named(may)} may read of {topics}")
     text = f"no user may read {topics}: Home Assistant is told of nothing. Add to "
     text += f"{settings.broker.acl.name} below the line `user` of its user: topic read {topics}"
     return Finding("warning", "bridge.home_assistant", text)

@@ -14,7 +14,7 @@ import yaml
 from appliance_process import HOST, MOSQUITTO, ApplianceProcess, MosquittoProcess
 from ros2_harness import Peer
 from test_home_assistant import check, rendered
-from waiting import PATIENCE
+from waiting import PATIENCE, eventually
 
 pytestmark = pytest.mark.usefixtures("isolated_domain")
 
@@ -207,6 +207,12 @@ async def test_through_a_link_to_home_assistants_broker(peer, tmp_path):
         lamp = found["lamp"]
         answers = ["-e", "r2d2/lamp/_reply/homeassistant"]
         assert home.press(lamp, lamp["payload_off"], *answers) == {"success": False, "message": ""}
+        # Without a bridge nothing is left there either.
+        appliance.stop()
+        settings["bridge"]["bus"] = "none"
+        appliance.config.write_text(yaml.safe_dump(settings))
+        appliance.start()
+        eventually(lambda: home.read("homeassistant/#", seconds=1, count=9) == {}, "none there")
     finally:
         print(appliance.log)
         appliance.stop()
