@@ -68,6 +68,7 @@ def binary():
             *(sys.executable, "-m", "PyInstaller", "--noconfirm", "--distpath", found.parent),
             *("--workpath", build, PROJECT / "appliance/packaging/appliance.spec"),
         ],
+        env={**os.environ, "PYINSTALLER_ZLIB_COMPRESSION_LEVEL": "1"},  # its size is no matter here
         capture_output=True,
         text=True,
         timeout=600,

@@ -68,7 +68,8 @@ PACKAGES = ("base-files", "libstdc++6", "python3-venv")
 CERTIFICATES = "etc/ssl/certs/ca-certificates.crt"
 #: Whether ROS 2 from PyPI is tried, too: a minute more.
 WITH_ROS = os.environ.get("APPLIANCE_PYTHONS_ROS") == "1"
-PIP = ("pip", "install", "--quiet", "--no-cache-dir")
+#: Of what is installed only the part that is used is compiled, when it is.
+PIP = ("pip", "install", "--quiet", "--no-cache-dir", "--no-compile")
 
 
 @dataclass
