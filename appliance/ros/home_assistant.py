@@ -330,7 +330,8 @@ class HomeAssistant:
         number of messages there, so they are gone through in steps.
         """
         retained = self._broker.retained
-        others, away = [], []
+        others: list[str] = []
+        away: list[str] = []
         for found in retained.find_in_steps(FILTER):
             if found is None:
                 yield
