@@ -260,7 +260,8 @@ class Client:
         closed = await self._is_closed(wire, "take-over", "the old connection is still there after")
         expected = ReasonCode.SESSION_TAKEN_OVER if self.profile.version == V5 else wire.reason
         if closed and wire.reason != expected:
-            self.wrong("take-over", f"the old connection ended with {wire.reason!r}")
+            how = f"{wire.error!r} after {wire.pauses} pauses, TLS: {self.profile.tls}"
+            self.wrong("take-over", f"the old connection ended with {wire.reason!r}: {how}")
 
     async def _is_closed(self, wire: Wire, kind: str, otherwise: str) -> bool:
         """Whether the broker closes it in time; else that is a fault, and it is cut."""

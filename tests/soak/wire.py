@@ -99,8 +99,9 @@ class Wire(asyncio.Protocol):
         self.paused = False
         #: How often it was paused.
         self.pauses = 0
-        #: Why the broker says that it ends the connection.
+        #: Why the broker says that it ends the connection, and the error that it ended with.
         self.reason: ReasonCode | None = None
+        self.error: Exception | None = None
         self.closed = asyncio.Event()
         self._transport: asyncio.Transport | None = None
         self._broken_off = False
@@ -139,16 +140,18 @@ class Wire(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._read_rest()
+        self.error = exc
         self._transport = None
         self.closed.set()
         self.owner.lost(self)
 
     def _read_rest(self) -> None:
-        """uvloop's TLS drops what came while reading was paused, when the end is behind it."""
+        """uvloop's TLS drops what came while reading was paused, when the end is behind it; and
+        so just after reading was resumed."""
         assert self._transport is not None
         tls: ssl.SSLObject | None = self._transport.get_extra_info("ssl_object")
         with contextlib.suppress(ssl.SSLError):
-            while self.paused and tls is not None and (data := tls.read(65536)):
+            while tls is not None and (data := tls.read(65536)):
                 self.data_received(data)
 
     def write(self, data: bytes) -> None:
