@@ -420,8 +420,10 @@ class Bridge:
         """
         conversions = self._conversions
         work = partial(self._hand_over, receiver, message, retain, origin, number)
-        if isinstance(receiver, Commands) or (size <= LITTLE and not conversions.waits(origin)):
+        if isinstance(receiver, Commands):
             work()
+        elif size <= LITTLE and not conversions.waits(origin):
+            conversions.little(work)
         elif conversions.has_room(origin, size):
             conversions.do(origin, size, work)
         else:

@@ -179,9 +179,9 @@ class Commands(ToRos):
                 self._settle(origin)
                 return None
         size = size_of(message.payload)
-        if size <= LITTLE and origin not in self._queued:
-            return self._finish(command)
         conversions = self._context.conversions
+        if size <= LITTLE and origin not in self._queued:
+            return conversions.little(partial(self._finish, command))
         if size <= LITTLE:
             return self._queue_behind_own(command)
         if not conversions.is_busy and not conversions.waits(origin):

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from time import thread_time
 from typing import TypeAlias, TypeVar
 
@@ -20,8 +21,12 @@ from appliance.broker.session import Session
 from appliance.net.callbacks import Entries
 from appliance.ros.payload.payloads import ZSTD_MAGIC
 
-#: A payload of at most so many bytes is converted within some ten microseconds.
+#: A payload of at most so many bytes is converted at once: within some ten microseconds, unless it
+#: is a list of objects, each of which is filled with defaults.
 LITTLE = 1024
+
+#: Units of cost in a second of work, see `Counters.cost`.
+UNITS = 250_000
 
 #: The limit of the bytes that are queued for one user; OVERHEAD is added for each message.
 WAITING_OF_USER = 16 * 1024 * 1024
@@ -83,11 +88,20 @@ class ConversionQueue:
         if who in self._waiting:
             self._wait(who, size, work)
         elif size <= LITTLE:
-            self._run(work)
+            self.little(partial(self._run, work))
         elif self.is_busy:
             self._wait(who, size, work)
         else:
             self._take(work)
+
+    def little(self, work: Callable[[], T]) -> T:
+        """Do work on a little payload now, whatever is queued, and charge what it has taken: a
+        kilobyte of JSON, 330 empty objects of a list, can take nine milliseconds."""
+        begun = thread_time()
+        try:
+            return work()
+        finally:
+            self._accounting.counters.cost += int((thread_time() - begun) * UNITS)
 
     def now(self, work: Callable[[], T]) -> T | None:
         """Do work that cannot be queued, and return its result; queued work is done later."""

@@ -217,7 +217,7 @@ class ToRos(Flow):
         other conversion is going on; otherwise it is in its turn."""
         conversions = self._context.conversions
         if size_of(message.payload) <= LITTLE:
-            cdr = self._convert(message, session)
+            cdr = conversions.little(partial(self._convert, message, session))
         elif conversions.is_busy:
             return None
         else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+from itertools import count
 
 import pytest
 
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.broker.accounts import Account
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.faults import Faults
 from appliance.broker.limits import Limits
 from appliance.broker.message import Message
@@ -451,6 +453,19 @@ def test_users_take_turns_then_their_clients_and_each_client_s_is_in_order():
     assert done[-1] == "first, little"
     assert not queue.waits(first) and queue._accounting.queued_bytes == 0
     assert first.account.bytes == 0
+
+
+def test_a_little_payload_that_takes_long_is_charged(monkeypatch):
+    """A kilobyte of empty objects takes milliseconds; it is done at once, whatever is queued."""
+    clock, queue = conversion_queue()
+    seconds = count()
+    monkeypatch.setattr(turns, "thread_time", lambda: 0.004 * next(seconds))
+    queue.do(None, 1, lambda: None)
+    cost = queue._accounting.counters.cost
+    assert cost == pytest.approx(1000, abs=1) == pytest.approx(COST_PER_TURN, abs=1)
+    assert queue.little(lambda: "its result") == "its result"
+    assert queue._accounting.counters.cost == pytest.approx(2 * cost, abs=1)
+    assert not queue.is_busy and not clock.soon
 
 
 def test_a_failed_conversion_does_not_stop_the_queue(escaped):
