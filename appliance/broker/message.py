@@ -145,37 +145,33 @@ class Message:
             self.wire_key = 0
             self.wire_head = b""
 
-    def encode_for(
+    def encode_head_for(
         self,
         first: int,
         packet_id: int,
-        subscription_ids: list[int] | None,
+        identifiers: bytes,
         now: float,
         alias: int = 0,
         *,
         named: bool = True,
     ) -> bytes:
-        """Encode a whole MQTT 5 packet for one receiver: the slow path.
+        """Encode an MQTT 5 packet for one receiver up to its payload: the slow path.
 
-        It contains the receiver's subscription identifiers [MQTT-3.3.4-3], its topic alias, which
-        replaces the topic unless `named`, and the time that is left of the expiry interval
-        [MQTT-3.3.2-6]. The properties are in mosquitto's order.
+        It contains the receiver's subscription identifiers [MQTT-3.3.4-3], which are encoded, its
+        topic alias, which replaces the topic unless `named`, and the time that is left of the
+        expiry interval [MQTT-3.3.2-6]. The properties are in mosquitto's order.
         """
-        before: Properties = {}
-        if alias:
-            before[Property.TOPIC_ALIAS] = alias
-        if subscription_ids:
-            before[Property.SUBSCRIPTION_IDENTIFIER] = subscription_ids
+        before = encode_property_list({Property.TOPIC_ALIAS: alias}) if alias else b""
         own = self.properties_wire
-        properties = encode_property_list(before) + own[decode_varint(own, 0)[1] :]
+        properties = before + identifiers + own[decode_varint(own, 0)[1] :]
         if self.expires_at is not None:
             left = round(min(max(0.0, self.expires_at - now), LONGEST_INTERVAL))
             properties += encode_property_list({Property.MESSAGE_EXPIRY_INTERVAL: left})
         body = self.topic_wire if named else b"\0\0"
         if first & 0x06:
             body += packet_id.to_bytes(2, "big")
-        body += encode_varint(len(properties)) + properties + self.payload
-        return bytes((first,)) + encode_varint(len(body)) + body
+        body += encode_varint(len(properties)) + properties
+        return bytes((first,)) + encode_varint(len(body) + len(self.payload)) + body
 
 
 class HeaderCache:

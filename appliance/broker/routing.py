@@ -173,9 +173,12 @@ class Router:
         undecided: list[AccessQuery] = []
         self._undecided = undecided
         try:
-            return self._decide_route(session, topic, undecided)
+            route = self._decide_route(session, topic, undecided)
         finally:
             self._undecided = None
+        # An alias of two bytes may stand for it, and each receiver is sent all of it.
+        self._counters.cost += (len(topic_wire) + len(route.targets) * len(topic_wire) // 16) >> 8
+        return route
 
     def _decide_route(self, session: Session, topic: str, undecided: list[AccessQuery]) -> Fanout:
         decision = self._may_publish(session, topic)

@@ -39,6 +39,9 @@ CHECK_COST = 3
 RETAINED_COST = 3
 
 
+#: A filter costs one more for so many bytes, each time that it is gone through.
+LONG_FILTER = 256
+
 #: Filters whose pending decisions are requested at a time.
 ASKED_AT_ONCE = 4
 
@@ -131,7 +134,7 @@ def subscribe(
             granted.append((subscription, is_new))
         elif explains and words is None:  # SUBACK has one string: that of the first refusal
             words = in_words(f"{quote(subscription.filter)}: {reason}")
-        if turn.is_over(SUBSCRIBE_COST + subscription.filter.count("/")):
+        if turn.is_over(_cost(subscription.filter)):
             yield None
     yield Suback(packet.packet_id, codes, words)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
     for subscription, is_new in granted:
@@ -179,9 +182,14 @@ def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterat
     codes: list[int] = []
     for name in packet.filters:
         codes.append(broker.unsubscribe(session, name))
-        if turn.is_over(SUBSCRIBE_COST + name.count("/")):
+        if turn.is_over(_cost(name)):
             yield None
     yield Unsuback(packet.packet_id, codes)  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
+
+
+def _cost(name: str) -> int:
+    """The cost of adding or removing a subscription with this filter."""
+    return SUBSCRIBE_COST + name.count("/") + len(name) // LONG_FILTER
 
 
 class _Turn:
@@ -209,7 +217,7 @@ def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None
         )
     for name in filters:
         _check_filter(broker, name)
-        if turn.is_over(CHECK_COST):
+        if turn.is_over(CHECK_COST + len(name) // LONG_FILTER):
             yield
 
 

@@ -349,8 +349,9 @@ class PacketFramer:
                 self._aliased += text_size(packet.topic)
                 self._aliased += -text_size(before) if before is not None else ALIAS_SIZE
                 self._aliases[alias] = packet.topic
-            elif alias in self._aliases:
+            elif alias in self._aliases:  # and was checked when it was given
                 packet.topic = self._aliases[alias]
+                return packet
             else:
                 raise ProtocolError(
                     ReasonCode.PROTOCOL_ERROR, f"topic alias {alias} was never given a topic"

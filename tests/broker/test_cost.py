@@ -6,6 +6,7 @@ from itertools import product
 
 import pytest
 
+from appliance.broker import output
 from appliance.broker.broker import (
     CHECKS_PER_COST_UNIT,
     COST_PER_TICK,
@@ -15,6 +16,8 @@ from appliance.broker.broker import (
 )
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.shared import MAXIMUM_CHECKED
+from appliance.broker.subscribing import LONG_FILTER
+from appliance.mqtt import framing
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will
 
@@ -168,3 +171,69 @@ def test_a_session_with_many_deep_filters_costs_at_its_end(join: Join, broker: B
     begun = broker.counters.cost
     peer.lose()
     assert broker.counters.cost - begun > 20 * 100 // LEVELS_PER_COST_UNIT
+
+
+def test_a_long_topic_behind_an_alias_costs_what_it_takes(join: Join, broker: Broker):
+    """Eight bytes stand for 64 KB, which are looked up, and sent to each reader."""
+    for number in range(19):
+        join(f"reader{number}").subscribe("#", 0)
+    peer = join("peer")
+    costs = []
+    for topic in ("a" * 100, "a" * 60_000):
+        peer.send(Publish(topic, b"", 0, properties={Property.TOPIC_ALIAS: 1}))
+        again = Publish("", b"", 0, properties={Property.TOPIC_ALIAS: 1})
+        costs.append(cost_of(broker, peer, again))
+    assert costs[1] - costs[0] >= (60_000 + 19 * 60_000 // 16) >> 8
+
+
+def test_an_alias_is_checked_where_it_is_given(join: Join, monkeypatch: pytest.MonkeyPatch):
+    checked = []
+    monkeypatch.setattr(framing, "check_topic", checked.append)
+    peer = join("peer")
+    peer.send(Publish("a/b", b"", 0, properties={Property.TOPIC_ALIAS: 1}))
+    for _ in range(10):
+        peer.send(Publish("", b"", 0, properties={Property.TOPIC_ALIAS: 1}))
+    assert checked == ["a/b"]
+
+
+@pytest.mark.parametrize("beginning", ["", "$share/g/"])
+def test_long_filters_cost_what_they_take(join: Join, broker: Broker, beginning: str):
+    peer = join("peer")
+    costs = []
+    for length in (10, 60_000):
+        begun = broker.counters.cost
+        peer.subscribe(beginning + "a" * length, 0)
+        peer.unsubscribe(beginning + "a" * length)
+        costs.append(broker.counters.cost - begun)
+    assert costs[1] - costs[0] >= 4 * (60_000 // LONG_FILTER)
+
+
+def test_a_thousand_identifiers_are_encoded_once_for_a_route(
+    join: Join, broker: Broker, monkeypatch: pytest.MonkeyPatch
+):
+    encoded = []
+    encode = output.encode_property_list
+    monkeypatch.setattr(output, "encode_property_list", lambda p: encoded.append(p) or encode(p))
+    # Its limit is compared with each message, of which none is sent.
+    reader = join("reader", properties={Property.MAXIMUM_PACKET_SIZE: 200})
+    filters = ["/".join(each) for each in product("a+", repeat=9)]
+    for number, name in enumerate(filters, 1):
+        reader.subscribe(name, properties={Property.SUBSCRIPTION_IDENTIFIER: [number]})
+    peer = join("peer")
+    topic = "/".join("a" * 9)
+    costs = [cost_of(broker, peer, Publish(topic, b"x", 0)) for _ in range(5)]
+    assert len(encoded) == 1 and len(encoded[0][Property.SUBSCRIPTION_IDENTIFIER]) == len(filters)
+    assert costs[0] >= len(filters) >> 3 and costs[1] < costs[0]
+
+
+def test_what_is_encoded_for_one_reader_shares_the_payload(join: Join):
+    """Of large messages with an expiry, an alias or an identifier."""
+    payload, count = b"x" * 1_000_000, 3
+    written: list[bytes] = []
+    for number in range(count):
+        reader = join(f"reader{number}", properties={Property.TOPIC_ALIAS_MAXIMUM: 1})
+        reader.subscribe("t", 0, properties={Property.SUBSCRIPTION_IDENTIFIER: [7]})
+        reader.transport.write = written.extend  # type: ignore[method-assign]
+    join("peer").send(Publish("t", payload, 0, properties={Property.MESSAGE_EXPIRY_INTERVAL: 9}))
+    large = [chunk for chunk in written if len(chunk) > 1000]
+    assert large == [payload] * count and len({*map(id, large)}) == 1
