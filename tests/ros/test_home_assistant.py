@@ -462,6 +462,8 @@ async def test_there_is_a_limit(
     await until(lambda: len(there.routes()) == 7)
     there.bridge._announce()
     await until(lambda: "told of 3 entities of 7" in caplog.text)
+    await until(lambda: len(told(there)) == 3, "those three")
+    await there.settle()
     assert len(told(there)) == 3
 
 
