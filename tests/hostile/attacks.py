@@ -1156,6 +1156,26 @@ async def topic_aliases(load: Load) -> None:
     await load.together(crowd(), abuse())
 
 
+@attack(r"may not publish to 'r2d2/forbidden", at_least=2.0, **BOUNDED)
+async def long_refusals(load: Load) -> None:
+    """Refused messages to a topic of 64 KB that a log line quotes, each time by new client ids."""
+    topic = f"r2d2/forbidden/{chr(0xE0001) * 16_370}"
+    first = Publish(topic, b"", properties={Property.TOPIC_ALIAS: 1})
+    again = Publish("", b"", properties={Property.TOPIC_ALIAS: 1})
+    data = encode5(first, *[again] * 6)
+
+    async def publish(number: int) -> None:
+        async for turn in load.rounds(0.05):
+            line = await load.join(f"refused-{number}-{turn}")
+            await line.send(data)
+            load.counts["refused messages"] += 7
+            await asyncio.sleep(0.02)
+            line.abort()
+            load.lines.discard(line)
+
+    await load.together(*(publish(number) for number in range(20)))
+
+
 # --- retained messages
 
 

@@ -75,6 +75,10 @@ BRIDGE = {
             "clamp": {"float64_values": [-1, 1]},
         }
         for encoding in ("json", "cdr")
+    ]
+    + [
+        {"ros": "/costly/path", "to": "ros", "type": "nav_msgs/msg/Path"},
+        {"ros": "/costly/ruled/path", "to": "ros", "type": "nav_msgs/msg/Path", "expire": "500 ms"},
     ],
     "services": [{"ros": "/costly", "type": "rcl_interfaces/srv/SetParameters"}],
 }
@@ -163,6 +167,11 @@ def sequences_json(count: int) -> bytes:
     return json.dumps(sequences(count), separators=(",", ":")).encode()
 
 
+def little_path() -> bytes:
+    """A kilobyte, in which each element of a list is filled with its defaults."""
+    return json_of(b"{}", 990, b"poses")
+
+
 #: Texts that make a message as much work as it may be, and far too much.
 JUST = 11_000
 FAR = 100_000
@@ -188,6 +197,10 @@ SHAPES = {
     "call-json-left-out": Shape(
         CALL, lambda: json_of(b"{}", 60_000), JSON, 1, (*WEIGHED, "bad_request"), 10
     ),
+    "call-little": Shape(CALL, lambda: json_of(b"{}", 990), JSON, 1, CONVERTED, 250),
+    "command-little": Shape("r2d2/costly/path", little_path, window=250),
+    "ruled-little": Shape("r2d2/costly/ruled/path", little_path, window=250, is_dated=True),
+    "released-little": Shape("r2d2/costly/path", little_path, qos=2),
     "command-json": Shape("r2d2/costly/json", lambda: sequences_json(JUST), window=10),
     "command-json-far": Shape("r2d2/costly/json", lambda: sequences_json(FAR)),
     "command-cdr": Shape("r2d2/costly/cdr", lambda: sequences_cdr(JUST), window=10),
