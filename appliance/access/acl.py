@@ -10,6 +10,7 @@ from typing import Final
 
 from appliance.access.rules import Permission, Rule, read_rules
 from appliance.broker.values import Action, Decision, Identity
+from appliance.mqtt.codec import quote
 from appliance.mqtt.topics import check_filter, matches, overlaps, parse_shared
 
 _UNFIT: Final = "a name that is empty or holds +, # or / cannot be put in"
@@ -367,13 +368,14 @@ class Acl:
                 yield _Applied(rule, filter)
 
     def _no_rule(self, identity: Identity, action: Action, topic: str) -> str:
-        return f"{self._name}: no rule lets {_who(identity)} {_VERBS[action]} {topic!r}"
+        # Shortened: it is logged, audited and kept with the topic's route, at a stranger's wish.
+        return f"{self._name}: no rule lets {_who(identity)} {_VERBS[action]} {quote(topic)}"
 
 
 def _who(identity: Identity) -> str:
     if identity.username is None:
         return "an anonymous client"
-    return f"user {identity.username!r}"
+    return f"user {quote(identity.username)}"
 
 
 def _substitute(filter: str, identity: Identity) -> str | None:

@@ -14,6 +14,10 @@ INTERVAL = 10.0
 #: Keys that are counted at the same time; above this the least recently used one is evicted.
 MAXIMUM_KEYS = 1024
 
+#: Characters that are kept of the last text of a key, and lines that one tick logs.
+LONGEST = 500
+LINES_PER_TICK = 64
+
 
 @dataclass(slots=True)
 class _Entry:
@@ -61,12 +65,18 @@ class RateLimitedLog:
             entry.log.warning(message, *args)
         else:
             entry.suppressed += 1
-            entry.last = message % args
+            entry.last = (message % args)[:LONGEST]
 
     def tick(self, now: float) -> None:
-        """Log the counts of suppressed warnings of intervals that have ended."""
+        """Log the counts of suppressed warnings of intervals that have ended; those that are more
+        than a few lines are left to the next calls."""
+        left = LINES_PER_TICK
         for key, entry in list(self._entries.items()):
             if now - entry.since >= INTERVAL:
+                if entry.suppressed:
+                    if not left:
+                        break
+                    left -= 1
                 self._log_suppressed(entry)
                 del self._entries[key]
 

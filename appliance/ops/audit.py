@@ -158,8 +158,9 @@ class Audit:
         self._put("stopped", pid=os.getpid())
 
     def _put(self, event: str, **fields: Any) -> None:
+        # Cut here already: a full queue of whole topics would be gigabytes.
         try:
-            self._queue.put_nowait({"time": _now(), "event": event, **fields})
+            self._queue.put_nowait(_cut({"time": _now(), "event": event, **fields}))
         except queue.Full:
             self._overflowed += 1
 

@@ -308,13 +308,10 @@ class Backlog:
         ):
             self._drop_unwritten(queue, now)
             return None
-        while self._tally.bytes + size > self._limits.size:
-            replaced = queue.latest.get(topic) if kept == "latest" else None
-            added = size - replaced.size if replaced is not None else size
-            if self._tally.bytes + added <= self._limits.size:
-                break
-            if not self._eviction.make_room(queue.lane, added, now):
-                return self._refuse(queue)
+        if self._tally.bytes + size > self._limits.size and not self._make_room(
+            queue, topic if kept == "latest" else None, size, now
+        ):
+            return self._refuse(queue)
         if kept == "all":
             if self._backlogs.failing:
                 return self._cannot_store(queue, qos)
@@ -349,6 +346,33 @@ class Backlog:
             self._idle = False
             self._wake()
         return None
+
+    def _make_room(self, queue: RuleQueue, latest: str | None, size: int, now: float) -> bool:
+        """Whether the message has room, of which the latest of a topic takes that of the one before
+        unless that is dropped meanwhile."""
+        while True:
+            replaced = None if latest is None else queue.latest.get(latest)
+            added = size if replaced is None else size - replaced.size
+            if self._tally.bytes + added <= self._limits.size:
+                return True
+            if not self._eviction.make_room(queue.lane, added, now):
+                return False
+            if replaced is None or queue.latest.get(replaced.topic) is replaced:
+                return True
+
+    @property
+    def work(self) -> int:
+        """The work of all that was dropped to make room, see `Counters.cost`."""
+        return self._eviction.work
+
+    @property
+    def is_owing(self) -> bool:
+        """Whether `drop_more` has something to do."""
+        return self._eviction.is_owing
+
+    def drop_more(self) -> None:
+        """Drop more of what large messages have displaced, a part; to be called in later turns."""
+        self._eviction.go_on()
 
     def _queue_of(self, rule: OutRule, now: float) -> RuleQueue:
         """The queue of an equal rule, or of one that is new."""
@@ -430,6 +454,7 @@ class Backlog:
         """Drop what has become too old; to be called every second or so."""
         self._log.tick(now)
         self._eviction.drop_outdated(now)
+        self._eviction.go_on()
         self._live.drop_outdated(self._queues.by_name.values(), now)
         if self._queues.forget_drained():
             self._sort()

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from typing import Final
 
 from appliance.broker.backlogs import Segment
 from appliance.upstream.backlog_counts import DropReason, Tally, too_old
-from appliance.upstream.live_messages import LiveMessages
+from appliance.upstream.live_messages import LIVE_SIZE, LiveMessages
 from appliance.upstream.read_ahead import ReadAhead
 from appliance.upstream.records import record_times
 from appliance.upstream.rule_queue import Entry, RuleQueue
@@ -16,6 +17,22 @@ from appliance.upstream.rule_queues import RuleQueues
 from appliance.upstream.rules import PRIORITIES, BacklogLimits
 
 log = logging.getLogger(__name__)
+
+#: The work of dropping one message, in units of `Counters.cost`, and the rules that are looked at
+#: for one unit more.
+DROP_COST: Final = 2
+RULES_PER_COST_UNIT: Final = 2
+
+#: The work that is done in one piece. A large message may displace tens of thousands of small ones,
+#: and their broker does nothing else meanwhile: it waits already while the others are dropped in
+#: later turns. What is not `Final` here tests replace, also in the compiled build.
+MOST_AT_ONCE = 1000
+
+#: By this part more than its size may wait meanwhile, and in any case one message.
+OWED_SHARE = 1 / 8
+
+#: No message has displaced more than could be dropped.
+_NOBODY: Final = len(PRIORITIES)
 
 
 class Eviction:
@@ -46,6 +63,12 @@ class Eviction:
         self._emptied = emptied
         #: How many had been dropped as full when that was logged last; None since there is room.
         self._full_since: int | None = None
+        #: The work of all that was dropped to make room, in units of `Counters.cost`.
+        self.work = 0
+        #: The most urgent lane of the messages for which more is to be dropped, of all that waits
+        #: and of what is forgotten with the connection; and how much of the latter may stay.
+        self._owed_to = self._live_owed_to = _NOBODY
+        self._live_limit = LIVE_SIZE
 
     def use(self, limits: BacklogLimits) -> None:
         """Follow other limits from now on."""
@@ -57,41 +80,91 @@ class Eviction:
         """Drop until a message of the lane has room: too old ones, then the lowest lane's oldest,
         in it the latest ones of who has more than a share of these first.
 
-        Whatever is more urgent than the message stays.
+        Whatever is more urgent than the message stays. What takes too long is left to `go_on`.
         """
-        limit = self._limits.size - size
-        if limit < 0:
+        limit = self._limits.size
+        if size > limit:
             return False
         self.drop_outdated(now)
-        if self._tally.bytes <= limit:
+        before = self._tally.bytes
+        if before + size <= limit:
             return True
         if self._limits.when_full == "refuse":
             return False
         self.say_full()
-        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            queues = self._queues.lanes[lowest]
-            while self._tally.bytes > limit and (
-                self._live.drop_of_largest(queues) or self._drop_oldest(lowest)
-            ):
-                pass
-        return self._tally.bytes <= limit
+        is_all = self._drop_down_to(max(limit, before) - size, lane)
+        after = self._tally.bytes + size
+        if after > limit:
+            if not _may_owe(before, after, limit, is_all=is_all):
+                return False
+            self._owed_to = min(self._owed_to, lane)
+        return True
 
     def make_live_room(self, lane: int, memory: int) -> bool:
         """Drop what is forgotten with the connection until so many bytes have room.
 
         As for `make_room`.
         """
-        if self._live.fits(memory):
+        live = self._live
+        if live.fits(memory):
             return True
         self.say_full()
+        before = live.memory
+        is_all = self._drop_live_down_to(max(LIVE_SIZE, before) - memory, lane)
+        after = live.memory + memory
+        if live.memory and after > LIVE_SIZE:
+            if not _may_owe(before, after, LIVE_SIZE, is_all=is_all):
+                return False
+            self._live_owed_to = min(self._live_owed_to, lane)
+            self._live_limit = max(LIVE_SIZE, memory)
+        return True
+
+    @property
+    def is_owing(self) -> bool:
+        """Whether `go_on` has something to do."""
+        return self._owed_to != _NOBODY or self._live_owed_to != _NOBODY
+
+    def go_on(self) -> None:
+        """Drop more of what was displaced by messages that wait already.
+
+        Without anything else in their lanes and below, that is they themselves in the end.
+        """
+        if self._owed_to != _NOBODY and self._drop_down_to(self._limits.size, self._owed_to):
+            self._owed_to = _NOBODY
+        if self._live_owed_to != _NOBODY and self._drop_live_down_to(
+            self._live_limit, self._live_owed_to
+        ):
+            self._live_owed_to = _NOBODY
+
+    def _drop_down_to(self, limit: int, lane: int) -> bool:
+        """Drop until so many bytes wait, from the lowest lane up to this one; False when there is
+        more to be dropped than may be in one piece."""
+        end = self.work + MOST_AT_ONCE
         for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
-            while not self._live.fits(memory):
-                waiting = [queue for queue in self._queues.lanes[lowest] if queue.live]
+            queues = self._queues.lanes[lowest]
+            while self._tally.bytes > limit:
+                if self.work >= end:
+                    return False
+                self.work += DROP_COST + len(queues) // RULES_PER_COST_UNIT
+                if not (self._live.drop_of_largest(queues) or self._drop_oldest(lowest)):
+                    break
+        return True
+
+    def _drop_live_down_to(self, limit: int, lane: int) -> bool:
+        """The same of what is forgotten with the connection, in bytes of memory."""
+        end = self.work + MOST_AT_ONCE
+        for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
+            queues = self._queues.lanes[lowest]
+            while self._live.memory > limit:
+                if self.work >= end:
+                    return False
+                self.work += DROP_COST + len(queues) // RULES_PER_COST_UNIT
+                waiting = [queue for queue in queues if queue.live]
                 if not waiting:
                     break
                 oldest = min(waiting, key=lambda queue: record_times(queue.live[0])[0])
                 self.drop_first_live(oldest, DropReason.FULL)
-        return not self._live.memory or self._live.fits(memory)
+        return True
 
     def drop_oldest_latest(self, lane: int) -> bool:
         """Drop the oldest latest message of the lowest lane that is not above, first of who has
@@ -99,6 +172,7 @@ class Eviction:
         self.say_full()
         for lowest in range(len(PRIORITIES) - 1, lane - 1, -1):
             queues = self._queues.lanes[lowest]
+            self.work += DROP_COST + len(queues) // RULES_PER_COST_UNIT
             if self._live.drop_of_largest(queues, topics=True):
                 return True
             firsts = [
@@ -221,3 +295,11 @@ class Eviction:
         self._tally.add(queue, -count, -size)
         self._tally.drop(queue, reason, count)
         self._emptied(queue)
+
+
+def _may_owe(before: int, after: int, limit: int, *, is_all: bool) -> bool:
+    """Whether a message may wait although more than the limit do with it, as others will be
+    dropped; `is_all` says that there are none."""
+    return after <= before or (
+        not is_all and (before <= limit or after <= limit * (1 + OWED_SHARE))
+    )

@@ -77,6 +77,17 @@ class Offers(Protocol):
         `user` has published it, see `UserShares`.
         """
 
+    @property
+    def work(self) -> int:
+        """The work of all that was dropped to make room, see `Counters.cost`."""
+
+    @property
+    def is_owing(self) -> bool:
+        """Whether `drop_more` has something to do."""
+
+    def drop_more(self) -> None:
+        """Drop more of what large messages have displaced, a part."""
+
 
 @dataclass(slots=True)
 class OutCounters:
@@ -153,10 +164,18 @@ class OutSession:
         return self._answering
 
     def take_turn(self) -> None:
-        """Continue with the retained messages, and with filters whose rights were not decided."""
+        """Continue with the retained messages, with filters whose rights were not decided, and with
+        what large messages have displaced."""
         session = self._session
         if session is None:
             return
+        backlog = self._backlog
+        if backlog.is_owing:
+            work = backlog.work
+            backlog.drop_more()
+            self._broker.counters.cost += backlog.work - work
+            if backlog.is_owing:
+                self._later()
         if self._must_ask:
             self._subscribe(session)
         session.take_turn()
@@ -255,7 +274,7 @@ class OutSession:
 
     def _offer(self, rule: OutRule, topic: str, message: Message) -> None:
         """Hand the message to the backlog; its publisher is told if that does not take it."""
-        broker = self._broker
+        broker, backlog = self._broker, self._backlog
         broker.counters.cost += OFFER_COST
         now = self._clock()
         expires_at = message.expires_at
@@ -266,7 +285,8 @@ class OutSession:
         retain = message.retain if rule.retain is None else rule.retain
         try:
             topic, properties = self._properties(topic, message)
-            refusal = self._backlog.offer(
+            work = backlog.work
+            refusal = backlog.offer(
                 rule,
                 topic,
                 message.payload,
@@ -278,7 +298,10 @@ class OutSession:
                 is_acknowledged=_is_acknowledged(publisher_of(message)),
                 user=self._user(message),
             )
-            if self._backlog.is_behind_disk:
+            broker.counters.cost += backlog.work - work
+            if backlog.is_owing:
+                self._later()
+            if backlog.is_behind_disk:
                 broker.disk.begin()
         except Exception:
             # The broker contains the fault. What is not in the backlog is not acknowledged.

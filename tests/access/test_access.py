@@ -365,6 +365,15 @@ def test_the_reason_for_an_anonymous_client(tmp_path: Path) -> None:
     assert decision.reason == "acl.conf: no rule lets an anonymous client subscribe to 'x/#'"
 
 
+@pytest.mark.parametrize("action", Action)
+def test_a_reason_shows_of_a_long_topic_the_beginning(tmp_path: Path, action: Action) -> None:
+    topic = "y" + "\U000e0001" * 16_000
+    acl = acl_of(tmp_path, EXAMPLE)
+    reason = acl.decide(Identity("b" * 60_000, "c"), action, topic).reason
+    assert len(reason) < 1_500 and "'y\\U000e0001" in reason and reason.endswith("…")
+    assert repr(topic) in str(acl.explain(NOBODY, topic))
+
+
 @pytest.mark.parametrize(
     ("rules", "topic", "allowed"),
     [

@@ -11,7 +11,13 @@ from appliance.broker.broker import ENDINGS_PER_TICK, Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Features, Limits
 from appliance.broker.message import Message
-from appliance.broker.rate_limited_log import BURST, INTERVAL, RateLimitedLog
+from appliance.broker.rate_limited_log import (
+    BURST,
+    INTERVAL,
+    LINES_PER_TICK,
+    LONGEST,
+    RateLimitedLog,
+)
 from appliance.broker.session import REPLAYED_PER_TURN, subscription_size
 from appliance.broker.values import Action
 from appliance.mqtt.codec import Properties, Property
@@ -89,6 +95,21 @@ def test_a_line_has_the_name_of_who_logs(caplog: pytest.LogCaptureFixture):
     limited.tick(INTERVAL)
     assert {record.name for record in caplog.records} == {__name__}
     assert caplog.messages[-1] == f"1 more of this kind, the last: number {BURST}"
+
+
+def test_of_suppressed_lines_little_is_kept_and_few_are_logged_at_once(caplog):
+    limited = RateLimitedLog()
+    log = logging.getLogger(__name__)
+    for key in range(3 * LINES_PER_TICK):
+        for _ in range(2):
+            limited.warning(log, 0.0, key, "%s", "x" * 10_000, burst=1)
+    assert all(len(entry.last) == LONGEST for entry in limited._entries.values())
+    caplog.clear()
+    for ticks in range(1, 4):
+        limited.tick(INTERVAL)
+        assert len(caplog.messages) == ticks * LINES_PER_TICK
+    assert not limited._entries
+    assert max(map(len, caplog.messages)) < LONGEST + 100
 
 
 @pytest.mark.parametrize("limits", [Limits(queue_full="drop-oldest", **SMALL)])

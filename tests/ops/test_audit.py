@@ -121,6 +121,15 @@ def test_names_of_strangers_forge_nothing_and_are_cut(tmp_path: Path) -> None:
     assert len(text) < 3000
 
 
+def test_events_are_cut_before_they_wait(tmp_path: Path) -> None:
+    audit = Audit(tmp_path / "audit.log", 1 << 20, 3)
+    audit.close()  # nothing is taken from the queue any more
+    audit.denied(session_of("alice", "c" * 1000), Action.PUBLISH, "t" * 60_000, "r" * 60_000)
+    event = audit._queue.get_nowait()
+    assert event is not None and event["topic"] == "t" * 256 + "…"
+    assert max(map(len, event.values())) == 257
+
+
 def test_it_is_rotated_by_size_and_so_many_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "audit.log"
     with open_audit(path, size=2000, keep=3) as audit:

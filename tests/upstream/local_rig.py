@@ -71,6 +71,9 @@ class FakeBacklog:
         self.offers: list[Offered] = []
         self.is_full = False
         self.is_behind_disk = False
+        #: Offers that displace so much each, and the pieces in which that is dropped later.
+        self.displaced = self.pieces = 0
+        self.work = 0
         self.fault: Exception | None = None
         self.staged: Callable[[], None] = lambda: None
 
@@ -102,8 +105,17 @@ class FakeBacklog:
         offered.is_acknowledged, offered.user = is_acknowledged, user
         offered.expires_in = None if expires_at is None else expires_at - now
         self.offers.append(offered)
+        self.work += self.displaced
         self.staged()
         return None
+
+    @property
+    def is_owing(self) -> bool:
+        return self.pieces > 0
+
+    def drop_more(self) -> None:
+        self.pieces -= 1
+        self.work += 100
 
     def taken(self) -> list[tuple[str, bytes]]:
         """What was offered since this was last asked."""

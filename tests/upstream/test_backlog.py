@@ -18,7 +18,8 @@ from appliance.upstream.backlog import (
 )
 from appliance.upstream.backlog_counts import BacklogCounts, DropReason
 from appliance.upstream.disk_room import UNWRITTEN_AWAITED, UNWRITTEN_FROM_ROS, UNWRITTEN_SIZE
-from appliance.upstream.live_messages import LATEST_SIZE
+from appliance.upstream.eviction import DROP_COST, MOST_AT_ONCE
+from appliance.upstream.live_messages import LATEST_SIZE, LIVE_SIZE
 from appliance.upstream.rule_queue import LOADED_OVERHEAD, Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
 from appliance.upstream.set_aside import ASIDE_SIZE
@@ -455,6 +456,102 @@ def test_full_of_what_is_more_urgent_the_message_itself_goes() -> None:
     assert link.offer("x" * 6_000, of=0) is None
     assert link.counts().waiting == waiting
     assert link.counts().dropped["r/h", DropReason.FULL] == 2
+
+
+def _drop_on(link: Link) -> int:
+    """Let the backlog drop what is displaced, in later turns; returns how many that takes."""
+    turns = 0
+    while link.backlog.is_owing:
+        before, work = sum(link.dropped().values()), link.backlog.work
+        link.backlog.drop_more()
+        dropped = sum(link.dropped().values()) - before
+        assert DROP_COST * dropped <= link.backlog.work - work <= MOST_AT_ONCE + DROP_COST
+        turns += 1
+    return turns
+
+
+def _full(*rules: OutRule) -> Link:
+    """A link to which 3,000 small states of the second rule wait, which fill it."""
+    link = Link(*rules, size=1_000_000, online=False)
+    for number in range(3_000):
+        link.offer(f"{number:285}", f"{number}", qos=0, of=1)
+    assert 990_000 < link.counts().bytes <= 1_000_000 and not link.backlog.work
+    return link
+
+
+def test_full_what_a_large_message_displaces_goes_in_pieces() -> None:
+    link = _full(rule("h", priority="high"), rule(keep="latest"))
+    assert link.offer("x" * 500_000) is None
+    first = link.dropped()["full"]
+    assert 0 < DROP_COST * first <= link.backlog.work <= MOST_AT_ONCE
+    # What comes meanwhile has room as ever: it makes that for itself.
+    assert link.offer("urgent") is None
+    assert link.offer("3000", "3000", qos=0, of=1) is None
+    assert link.dropped()["full"] <= first + 3
+    assert link.counts().bytes > 1_000_000
+    assert _drop_on(link) >= 2
+    assert link.counts().bytes <= 1_000_000
+    dropped = link.dropped()["full"]
+    assert 1_400 < dropped < 1_700  # not more than needed
+    link.backlog.connected()
+    sent = [each.strip() for each in link.drain()]
+    assert sent[:2] == ["x" * 500_000, "urgent"]
+    rest = [int(each) for each in sent if each.isdigit()]
+    assert rest == list(range(dropped, 3_001))
+
+
+def test_full_the_clock_drops_on_too() -> None:
+    link = _full(rule("h", priority="high"), rule(keep="latest"))
+    link.offer("x" * 500_000)
+    for _ in range(5):
+        link.backlog.tick(link.backlogs.time)
+    assert not link.backlog.is_owing and link.counts().bytes <= 1_000_000
+
+
+def test_full_little_more_than_the_size_may_wait_meanwhile() -> None:
+    link = _full(rule("h", priority="high"), rule(keep="latest"))
+    for number in range(3):  # of which one after the other displaces more than goes in one piece
+        assert link.offer(f"{number}" * 400_000) is None
+    assert link.counts().dropped["r/h", DropReason.FULL] == 2
+    assert link.counts().bytes < 1_400_000
+    _drop_on(link)
+    assert link.offer("3" * 400_000) is None
+    _drop_on(link)
+    assert link.counts().bytes <= 1_000_000
+    link.backlog.connected()
+    assert [each[0] for each in link.drain() if len(each) > 300] == ["0", "3"]
+
+
+def test_full_of_what_is_more_urgent_a_large_message_goes_in_the_end() -> None:
+    rules = rule("h", priority="high"), rule(keep="latest", priority="low"), rule("l")
+    link = _full(*rules)
+    for _ in range(70):
+        link.offer("x" * 10_000)
+    assert DROP_COST * link.counts().lanes[2] > MOST_AT_ONCE
+    assert link.offer("y" * 500_000, of=2) is None and link.counts().lanes[1] == 1
+    _drop_on(link)
+    assert link.counts().lanes == (70, 0, 0)
+    assert link.counts().dropped["r/l", DropReason.FULL] == 1
+
+
+@pytest.mark.parametrize("size", [2_000_000, 5_000_000])
+def test_what_is_forgotten_is_displaced_in_pieces(size: int) -> None:
+    link = Link(rule(keep="none"))
+    number = 0
+    while not link.dropped():
+        link.offer(f"{number}".ljust(10))
+        number += 1
+    assert link.counts().waiting > 20_000
+    work = link.backlog.work
+    link.offer("x" * size)
+    first = link.dropped()["full"] - 1
+    assert 0 < DROP_COST * first <= link.backlog.work - work <= MOST_AT_ONCE
+    link.offer("y" * size)  # one more has no room meanwhile
+    assert _drop_on(link) > 10
+    sent = link.drain()
+    assert sent[-1] == "x" * size
+    assert [int(each) for each in sent[:-1]] == list(range(number - len(sent) + 1, number))
+    assert (len(sent) == 1) == (size > LIVE_SIZE)
 
 
 @pytest.mark.parametrize("room", range(2, 14))
@@ -1206,6 +1303,7 @@ def test_more_topics_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -
     link.offer("high", "high", of=2)
     waiting = link.counts().waiting
     assert 15 < waiting < 30 and link.dropped() == {"full": 101 - waiting}
+    assert link.backlog.work >= DROP_COST * (101 - waiting)
     expected = {"high", *(f"{number}" for number in range(101 - waiting, 100))}
     assert set(link.drain()) == expected
     link = Link(*rules, online=False, when_full="refuse")

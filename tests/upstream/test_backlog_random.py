@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from appliance.upstream import backlog as module
-from appliance.upstream import live_messages, read_ahead
+from appliance.upstream import eviction, live_messages, read_ahead
 from appliance.upstream.backlog_counts import DropReason
 from appliance.upstream.rule_queue import ENTRY_OVERHEAD, GONE, Entry
 from appliance.upstream.rules import OutRule
@@ -82,6 +82,10 @@ class Twin:
         self.later: dict[Entry, Sent] = {}
         self.online = True
         self.serial = 0
+        #: Spaces behind what is sent; and whether what a message displaces goes in pieces.
+        self.padding = [0, 0, 10, 100]
+        self.in_pieces = False
+        self.owed = 0
         #: Values that memory had no room for.
         self.on_disk = 0
         self.seen_drops: dict[tuple[str, DropReason], int] = {}
@@ -104,7 +108,7 @@ class Twin:
         qos = choose.randrange(3)
         retain = choose.random() < 0.2
         self.serial += 1
-        name = f"{self.serial}" + " " * choose.choice([0, 0, 10, 100])
+        name = f"{self.serial}" + " " * choose.choice(self.padding)
         topic = f"{self.rules[of].topic}/{choose.randrange(4)}"
         keep = self.rules[of].keep
         kind = keep if keep != "auto" else "latest" if retain or not qos else "all"
@@ -148,6 +152,10 @@ class Twin:
             self.on_disk += value.single is not None
         else:
             waiting.live.append(sent)
+        self.owed += self.link.backlog.is_owing
+        while self.link.backlog.is_owing and choose.random() < 0.9:
+            self.link.backlog.drop_more()
+        self.take_drops()
 
     def unsettled(self, of: int) -> list[Sent]:
         """What was handed out of a rule, in the order of its publication."""
@@ -378,7 +386,7 @@ class Twin:
         assert counts.in_flight == len(self.flying)
         seen = {key: number for key, number in self.seen_drops.items() if number}
         assert dict(counts.dropped) == seen
-        assert counts.bytes <= self.link.limits.size
+        assert counts.bytes <= self.link.limits.size * (2 if self.in_pieces else 1)
 
     # --- the ends -------------------------------------------------------------------------------
 
@@ -452,6 +460,19 @@ def test_like_a_list(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_like_a_full_list(seed: int) -> None:
     _compare(Twin(seed, PLAIN, size=4_000), seed, OPERATIONS + ["offer"] * 10)
+
+
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("seed", range(20))
+def test_like_a_full_list_of_which_little_is_dropped_at_once(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(eviction, "MOST_AT_ONCE", 7)
+    monkeypatch.setattr(eviction, "OWED_SHARE", 1.0)
+    twin = Twin(seed, PLAIN, size=8_000)
+    twin.padding, twin.in_pieces = [0, 0, 10, 100, 3_000], True
+    _compare(twin, seed, OPERATIONS + ["offer"] * 10)
+    assert twin.owed
 
 
 @pytest.mark.usefixtures("little_memory")

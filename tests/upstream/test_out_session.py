@@ -176,6 +176,24 @@ def test_a_hundred_thousand_retained_messages_stop_nobody(rig: Rig) -> None:
     assert rig.out.counters.offered == 20_000
 
 
+def test_what_a_message_displaces_is_counted_and_goes_in_turns(rig: Rig) -> None:
+    rig.begin()
+    peer = rig.join()
+    counters, backlog = rig.broker.counters, rig.backlog
+    before = counters.cost
+    peer.publish("r2/events/a", b"x", 1)
+    assert counters.cost - before < 100 and not rig.turns
+    backlog.displaced, backlog.pieces = 700, 3
+    before = counters.cost
+    peer.publish("r2/events/a", b"x", 1)
+    assert 700 <= counters.cost - before < 800
+    for _ in range(3):
+        before = counters.cost
+        rig.turn()
+        assert counters.cost - before == 100
+    assert not rig.turns
+
+
 def test_what_comes_from_there_is_not_sent_back(tmp_path: Path) -> None:
     keys = 'user: upstream, out: [{topic: "#"}], in: [{topic: "mission/#"}]'
     rig = Rig(tmp_path, keys=keys)
