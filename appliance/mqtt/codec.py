@@ -584,7 +584,12 @@ def check_qos(qos: int) -> int:
 
 def quote(text: str) -> str:
     """`text` for a log line: escaped, and not longer than a line."""
-    return repr(text) if len(text) <= 100 else repr(text[:100]) + "…"
+    part = text[:100]
+    shown = repr(part)
+    if len(shown) > 300:  # what is escaped takes up to ten characters
+        part = text[:25]
+        shown = repr(part)
+    return shown if len(part) == len(text) else shown + "…"
 
 
 def reason_name(code: int) -> str:
