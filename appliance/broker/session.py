@@ -96,6 +96,7 @@ class Session:
         "latest",
         "link",
         "queue",
+        "queue_bytes",
         "rate_limits",
         "rated",
         "readable",
@@ -150,6 +151,8 @@ class Session:
         self.batch = 0
         #: QoS 1 and 2, waiting for the window or the client.
         self.queue: deque[Delivery] = deque()
+        #: The bytes of these messages: to add them up for each new one would cost as much as all.
+        self.queue_bytes = 0
         #: Set while publishers may have to wait for its client.
         self.congestion: Congestion | None = None
         #: Retained messages of new subscriptions, by filter; they are sent before newer messages.
@@ -309,6 +312,7 @@ class Session:
         self.account.bytes += size
         self.accounting.queued_bytes += size
         self.queue.append(delivery)
+        self.queue_bytes += size
         if self.congestion is None and 2 * len(self.queue) > self.accounting.queue_messages:
             self._congest()
         return True
@@ -320,7 +324,7 @@ class Session:
     def _drop_oldest_for(self, message: Message, refusable: bool) -> bool:
         """Drop the oldest queued messages to make room; False when that is not enough."""
         accounting = self.accounting
-        if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
+        if not self.fits(message.size - self.queue_bytes):
             return False
         if self.expiry and refusable and self.accounting.failing:
             return False
@@ -329,6 +333,7 @@ class Session:
         ):
             self._report_full(message.size)
             oldest = self.queue.popleft()
+            self.queue_bytes -= oldest[0].size
             self._uncount(oldest[0])
             self._settled(oldest)
             self.drop(oldest[0], "queue_full")
@@ -424,6 +429,7 @@ class Session:
         while self.queue and link.writable and len(inflight) < self.window:
             delivery = self.queue.popleft()
             message = delivery[0]
+            self.queue_bytes -= message.size
             # Most messages neither expire nor have to be checked, which saves two calls for each.
             if (message.expires_at is not None and self.accounting.has_expired(message)) or (
                 self.unchecked and self._is_forbidden(message)
@@ -442,6 +448,7 @@ class Session:
         if dropped:
             for delivery in self.queue:
                 if is_old(delivery[0]):
+                    self.queue_bytes -= delivery[0].size
                     self._uncount(delivery[0])
                     self._settled(delivery)
                     self.drop(delivery[0], "expired")
@@ -477,6 +484,7 @@ class Session:
         """Take over the messages that the store has for this session."""
         self.inflight.update(inflight)
         self.queue.extend(queue)
+        self.queue_bytes += sum(delivery[0].size for delivery in queue)
         self.received.update(received)
         for delivery in (*inflight.values(), *queue):
             if delivery is not None:
@@ -892,13 +900,16 @@ class Session:
                 if delivery is not None and delivery[1] == 1 and is_given(delivery):
                     self.give_up(packet_id)
         remaining: deque[Delivery] = deque()
+        given = 0
         for delivery in self.queue:
             if is_given(delivery):
+                given += delivery[0].size
                 self._uncount(delivery[0])
                 self._settled(delivery)
             else:
                 remaining.append(delivery)
         self.queue = remaining
+        self.queue_bytes -= given
         if self.congestion is not None:
             self._relieve(self.congestion)
 
@@ -937,6 +948,7 @@ class Session:
         self.subscriptions.clear()
         for waiting in (self.queue, self.latest, self.large, self.inflight, self.received):
             waiting.clear()
+        self.queue_bytes = 0
         self.resends.clear()
         self.replays.clear()
         self.routes.clear()  # their targets may refer to this session: avoid a reference cycle
