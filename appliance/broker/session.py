@@ -25,6 +25,11 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 #: some milliseconds, then it is the turn of other clients.
 REPLAYED_PER_TURN = 512
 
+#: The cost of one of these, which may be a step of the search for them. REPLAYS_PER_COST_UNIT
+#: replays that are looked at, and cannot go on, add one unit.
+REPLAY_COST = 2
+REPLAYS_PER_COST_UNIT = 8
+
 #: The size, in bytes, above which a message is large: an image or a map, not a state or a command.
 #: A slow client gets large QoS 0 messages after everything else, see `Link.is_behind`.
 LARGE_MESSAGE = 32 * 1024
@@ -66,6 +71,18 @@ class SessionAccounting(Accounting):
         self.rates = RateSchedule(lambda: self.now)
 
 
+class Replay:
+    """The retained messages that a new subscription is still to be sent."""
+
+    __slots__ = ("deliveries", "waiting")
+
+    def __init__(self, deliveries: Iterator[Delivery | None]) -> None:
+        #: None among them is a message that is skipped, or a step of the search.
+        self.deliveries = deliveries
+        #: The next one, if it has been looked up and could not be sent yet.
+        self.waiting: Delivery | None = None
+
+
 class Session:
     """The session state of a client id (3.1.1 section 3.1.1, 5.0 section 4.1).
 
@@ -92,10 +109,12 @@ class Session:
         "inflight",
         "is_full_logged",
         "is_inside",
+        "is_replaying",
         "large",
         "latest",
         "link",
         "queue",
+        "queue_bytes",
         "rate_limits",
         "rated",
         "readable",
@@ -103,6 +122,7 @@ class Session:
         "received",
         "replays",
         "replays_left",
+        "replays_of_qos_0",
         "resends",
         "routes",
         "subscriptions",
@@ -150,11 +170,16 @@ class Session:
         self.batch = 0
         #: QoS 1 and 2, waiting for the window or the client.
         self.queue: deque[Delivery] = deque()
+        #: The bytes of these messages: to add them up for each new one would cost as much as all.
+        self.queue_bytes = 0
         #: Set while publishers may have to wait for its client.
         self.congestion: Congestion | None = None
         #: Retained messages of new subscriptions, by filter; they are sent before newer messages.
         #: Each is looked up when it can be sent, so that a slow client's replay takes no memory.
-        self.replays: dict[str, Iterator[Delivery | None]] = {}
+        self.replays: dict[str, Replay] = {}
+        #: Those among them that do not need the window [MQTT-3.3.4-8].
+        self.replays_of_qos_0: dict[str, Replay] = {}
+        self.is_replaying = False
         self.replays_left = REPLAYED_PER_TURN
         #: QoS 0 messages for a slow client, oldest first: the latest of each topic or, if the limit
         #: `keep` is set, that many messages, by number.
@@ -309,6 +334,7 @@ class Session:
         self.account.bytes += size
         self.accounting.queued_bytes += size
         self.queue.append(delivery)
+        self.queue_bytes += size
         if self.congestion is None and 2 * len(self.queue) > self.accounting.queue_messages:
             self._congest()
         return True
@@ -320,7 +346,7 @@ class Session:
     def _drop_oldest_for(self, message: Message, refusable: bool) -> bool:
         """Drop the oldest queued messages to make room; False when that is not enough."""
         accounting = self.accounting
-        if not self.fits(message.size - sum(delivery[0].size for delivery in self.queue)):
+        if not self.fits(message.size - self.queue_bytes):
             return False
         if self.expiry and refusable and self.accounting.failing:
             return False
@@ -329,6 +355,7 @@ class Session:
         ):
             self._report_full(message.size)
             oldest = self.queue.popleft()
+            self.queue_bytes -= oldest[0].size
             self._uncount(oldest[0])
             self._settled(oldest)
             self.drop(oldest[0], "queue_full")
@@ -339,8 +366,14 @@ class Session:
 
         A None among the deliveries is a message that is skipped.
         """
+        self._end_replay(topic_filter)
+        self.replays[topic_filter] = replay = Replay(deliveries)
+        if not self.subscriptions[topic_filter].qos:
+            self.replays_of_qos_0[topic_filter] = replay
+
+    def _end_replay(self, topic_filter: str) -> None:
         self.replays.pop(topic_filter, None)
-        self.replays[topic_filter] = deliveries
+        self.replays_of_qos_0.pop(topic_filter, None)
 
     def take_turn(self) -> None:
         """Send what is queued, in a new turn: other clients have had theirs in between."""
@@ -383,47 +416,84 @@ class Session:
                 self._cannot_be_sent(error, packet_id)
 
     def _pump_replays(self, link: Link) -> bool:
-        """Send retained messages; False when the limit of one turn is reached."""
-        for topic_filter, deliveries in list(self.replays.items()):
-            needs_window = self.subscriptions[topic_filter].qos > 0  # QoS 0 does not [MQTT-3.3.4-8]
-            while link.writable and not (needs_window and len(self.inflight) >= self.window):
-                if not self.replays_left:
-                    return False
-                self.replays_left -= 1
-                try:
-                    delivery = next(deliveries)
-                except StopIteration:
-                    del self.replays[topic_filter]
-                    if self.expiry and needs_window:
-                        self.accounting.store.subscribed(self, self.subscriptions[topic_filter])
-                    break
-                except Exception as error:
-                    self.accounting.faults.caught("session.replay", error, self)
-                    del self.replays[topic_filter]
-                    break
+        """Send retained messages; False when the limit of one turn is reached.
+
+        Thousands of replays may wait for the window. Once it is full only those are looked at that
+        do not need it, so that an acknowledgement costs what it makes room for.
+        """
+        if self.is_replaying:  # a session inside the appliance acknowledges in `publish`
+            return True
+        self.is_replaying = True
+        try:
+            if len(self.inflight) < self.window and not self._go_on_with(self.replays, link):
+                return False
+            return len(self.inflight) < self.window or self._go_on_with(self.replays_of_qos_0, link)
+        finally:
+            self.is_replaying = False
+
+    def _go_on_with(self, replays: dict[str, Replay], link: Link) -> bool:
+        """Go on with all replays, as long as the window has room, or with those of QoS 0."""
+        needs_window = replays is self.replays
+        accounting = self.accounting
+        ended: list[str] = []
+        failed: list[str] = []
+        looked, has_turn = 0, True
+        for topic_filter, replay in replays.items():
+            if not (has_turn and link.writable):
+                break
+            if needs_window and len(self.inflight) >= self.window:
+                break
+            looked += 1
+            is_free = topic_filter in self.replays_of_qos_0
+            while link.writable and (is_free or len(self.inflight) < self.window):
+                delivery, replay.waiting = replay.waiting, None
                 if delivery is None:
-                    continue
+                    if not self.replays_left:
+                        has_turn = False
+                        break
+                    self.replays_left -= 1
+                    accounting.counters.cost += REPLAY_COST
+                    try:
+                        delivery = next(replay.deliveries)
+                    except StopIteration:
+                        ended.append(topic_filter)
+                        break
+                    except Exception as error:
+                        accounting.faults.caught("session.replay", error, self)
+                        failed.append(topic_filter)
+                        break
+                    if delivery is None:
+                        continue
                 message, qos, _, _, _ = delivery
                 if (
-                    self.inflight and not self.fits(message.size)
+                    len(self.inflight) >= self.window
+                    or (self.inflight and not self.fits(message.size))
                     if qos
                     else message.size > LARGE_MESSAGE and link.is_behind()
                 ):
                     # Continue when messages are acknowledged, or when output has been written.
-                    self.replays[topic_filter] = itertools.chain((delivery,), deliveries)
+                    replay.waiting = delivery
                     break
                 if qos:
                     self._count(message)
                     self._send(link, delivery)
                 else:
                     self._publish(link, delivery)
-        return True
+        accounting.counters.cost += looked // REPLAYS_PER_COST_UNIT
+        for topic_filter in failed:
+            self._end_replay(topic_filter)
+        for topic_filter in ended:
+            self._end_replay(topic_filter)
+            if self.expiry and self.subscriptions[topic_filter].qos:
+                accounting.store.subscribed(self, self.subscriptions[topic_filter])
+        return has_turn
 
     def _pump_queue(self, link: Link) -> None:
         inflight = self.inflight
         while self.queue and link.writable and len(inflight) < self.window:
             delivery = self.queue.popleft()
             message = delivery[0]
+            self.queue_bytes -= message.size
             # Most messages neither expire nor have to be checked, which saves two calls for each.
             if (message.expires_at is not None and self.accounting.has_expired(message)) or (
                 self.unchecked and self._is_forbidden(message)
@@ -442,6 +512,7 @@ class Session:
         if dropped:
             for delivery in self.queue:
                 if is_old(delivery[0]):
+                    self.queue_bytes -= delivery[0].size
                     self._uncount(delivery[0])
                     self._settled(delivery)
                     self.drop(delivery[0], "expired")
@@ -477,6 +548,7 @@ class Session:
         """Take over the messages that the store has for this session."""
         self.inflight.update(inflight)
         self.queue.extend(queue)
+        self.queue_bytes += sum(delivery[0].size for delivery in queue)
         self.received.update(received)
         for delivery in (*inflight.values(), *queue):
             if delivery is not None:
@@ -750,6 +822,13 @@ class Session:
         if subscription.filter not in self.subscriptions:
             self.take(subscription_size(subscription.filter))
         self.subscriptions[subscription.filter] = subscription
+        is_of_qos_0 = subscription.filter in self.replays_of_qos_0
+        if subscription.filter in self.replays and is_of_qos_0 is (subscription.qos > 0):
+            self.replays_of_qos_0 = {  # it goes on with the new QoS, in its place
+                name: replay
+                for name, replay in self.replays.items()
+                if not self.subscriptions[name].qos
+            }
         limit = self.rate_limits.get(subscription.filter)
         if (limit.rate if limit is not None else 0.0) == subscription.max_rate:
             return
@@ -765,7 +844,7 @@ class Session:
         """Remove a subscription; False when there is none."""
         if self.subscriptions.pop(topic_filter, None) is None:
             return False
-        self.replays.pop(topic_filter, None)
+        self._end_replay(topic_filter)
         limit = self.rate_limits.pop(topic_filter, None)
         if limit is not None:
             limit.end()
@@ -892,13 +971,16 @@ class Session:
                 if delivery is not None and delivery[1] == 1 and is_given(delivery):
                     self.give_up(packet_id)
         remaining: deque[Delivery] = deque()
+        given = 0
         for delivery in self.queue:
             if is_given(delivery):
+                given += delivery[0].size
                 self._uncount(delivery[0])
                 self._settled(delivery)
             else:
                 remaining.append(delivery)
         self.queue = remaining
+        self.queue_bytes -= given
         if self.congestion is not None:
             self._relieve(self.congestion)
 
@@ -917,9 +999,8 @@ class Session:
             waiting.clear()
         for limit in self.rate_limits.values():
             limit.end()
-        for topic_filter in list(self.replays):
-            if not self.subscriptions[topic_filter].qos:
-                del self.replays[topic_filter]
+        for topic_filter in list(self.replays_of_qos_0):
+            self._end_replay(topic_filter)
         self.routes.clear()
         self.readable.clear()
 
@@ -937,8 +1018,10 @@ class Session:
         self.subscriptions.clear()
         for waiting in (self.queue, self.latest, self.large, self.inflight, self.received):
             waiting.clear()
+        self.queue_bytes = 0
         self.resends.clear()
         self.replays.clear()
+        self.replays_of_qos_0.clear()
         self.routes.clear()  # their targets may refer to this session: avoid a reference cycle
 
     def close_link(self, reason: ReasonCode, message: str) -> None:

@@ -497,6 +497,7 @@ def check_accounts(
     total = 0
     for session in broker.sessions.values():
         assert session.bytes == held_bytes(session), session
+        assert session.queue_bytes == sum(each[0].size for each in session.queue), session
         topic_bytes = sum(limit.topic_bytes for limit in session.rate_limits.values())
         assert session.topic_bytes == topic_bytes, session
         total += session.bytes + topic_bytes

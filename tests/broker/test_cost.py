@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import ClassVar
 
 import pytest
 
@@ -15,11 +16,15 @@ from appliance.broker.broker import (
     Broker,
 )
 from appliance.broker.counters import COST_PER_TURN
+from appliance.broker.link import InsideLink
+from appliance.broker.message import Message
+from appliance.broker.session import REPLAYED_PER_TURN, Replay
 from appliance.broker.shared import MAXIMUM_CHECKED
 from appliance.broker.subscribing import LONG_FILTER
 from appliance.mqtt import framing
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Publish, Pubrel, Subscription, Will
+from appliance.mqtt.packets import Publish, Pubrel, Subscribe, Subscription, Will
+from appliance.mqtt.topics import STEP
 
 from .conftest import FakeAccess, Join, Peer, lasting
 
@@ -237,3 +242,128 @@ def test_what_is_encoded_for_one_reader_shares_the_payload(join: Join):
     join("peer").send(Publish("t", payload, 0, properties={Property.MESSAGE_EXPIRY_INTERVAL: 9}))
     large = [chunk for chunk in written if len(chunk) > 1000]
     assert large == [payload] * count and len({*map(id, large)}) == 1
+
+
+class Watched(dict[str, Replay]):
+    """Replays that count how many of them are looked at."""
+
+    looked = 0
+
+    def items(self):  # type: ignore[override]
+        for item in super().items():
+            self.looked += 1
+            yield item
+
+
+def test_a_search_for_retained_messages_costs_though_none_is_found(join: Join, broker: Broker):
+    inside = broker.accounting.accounts.inside
+    nodes = 2 * 5000  # that it visits
+    for number in range(nodes // 2):
+        broker.retained.keep(Message(f"w/{number}/a/x", b"x", retain=True), inside)
+    peer = join("peer")
+    begun = broker.counters.cost
+    peer.subscribe("w/+/a/none")
+    assert peer.transport.laters, "it goes on in a later turn"
+    first = broker.counters.cost - begun
+    assert 2 * REPLAYED_PER_TURN <= first < 2.5 * COST_PER_TURN
+    while peer.transport.laters:
+        peer.go_on()
+    assert peer.payloads() == []
+    assert broker.counters.cost - begun >= 2 * (nodes // STEP)
+
+
+@pytest.mark.parametrize("qos", [1, 2])
+def test_an_acknowledgement_looks_only_at_the_replay_that_it_makes_room_for(
+    join: Join, broker: Broker, qos: int
+):
+    publisher, peer = join("publisher"), join("peer")
+    count = 200
+    filters = [f"t/{number}" for number in range(count)]
+    for name in filters:
+        publisher.publish(name, b"x", 2, retain=True)
+    peer.send(Subscribe(1, [Subscription(name, qos) for name in filters]))
+    while peer.transport.laters:
+        peer.go_on()
+    session = peer.session
+    heard = [packet for packet in peer.received() if isinstance(packet, Publish)]
+    assert len(heard) == session.window < count // 4
+    replays = session.replays = Watched(session.replays)
+    topics = [packet.topic for packet in heard]
+    while heard:
+        replays.looked = 0
+        begun = broker.counters.cost
+        peer.acknowledge(heard.pop(0))
+        # The one that is at its end, the one that has a message, and the one where the walk stops.
+        assert replays.looked <= 3
+        assert broker.counters.cost - begun <= 10
+        came = peer.messages()
+        assert len(came) == (len(topics) < count)
+        heard += came
+        topics += [packet.topic for packet in came]
+    assert not session.replays and not session.inflight
+    assert topics == filters, "in their order"
+
+
+def test_replays_of_qos_0_do_not_wait_for_the_window(join: Join):
+    """Nor does one whose subscription has been replaced by one of QoS 0."""
+    publisher = join("publisher")
+    for topic in ("a/1", "a/2", "a/3", "b/1", "b/2", "c"):
+        publisher.publish(topic, b"x", 1, retain=True)
+    peer = join("peer", properties={Property.RECEIVE_MAXIMUM: 1})
+    wanted = [Subscription("a/+", 1), Subscription("b/+", 0), Subscription("c", 1)]
+    peer.send(Subscribe(1, wanted))
+    sent = [packet for packet in peer.received() if isinstance(packet, Publish)]
+    assert [packet.topic for packet in sent] == ["a/1", "b/1", "b/2"]
+    peer.send(Subscribe(2, [Subscription("a/+", 0, retain_handling=2)]))
+    again = [packet for packet in peer.received() if isinstance(packet, Publish)]
+    assert [(packet.topic, packet.qos) for packet in again] == [("a/2", 0), ("a/3", 0)]
+    peer.acknowledge(sent[0])
+    assert [packet.topic for packet in peer.drain()] == ["c"]
+    assert not peer.session.replays and not peer.session.replays_of_qos_0
+
+
+def test_a_retained_message_that_waits_for_the_network_is_looked_up_once(
+    join: Join, broker: Broker
+):
+    """However often it is tried: otherwise each try made the search for the next one deeper."""
+    message = Message("map", bytes(40_000), retain=True)
+    broker.retained.keep(message, broker.accounting.accounts.inside)
+    peer = join("peer")
+    peer.transport.behind = True
+    peer.subscribe("map")
+    left = peer.session.replays_left
+    for _ in range(1000):
+        peer.session.pump()
+    assert peer.session.replays_left == left > 0
+    assert peer.payloads() == []
+    peer.transport.behind = False
+    peer.client.output.caught_up()
+    broker.flush()
+    assert peer.payloads() == [message.payload]
+    assert not peer.session.replays
+
+
+def test_a_session_inside_that_acknowledges_at_once_gets_all_that_is_retained(
+    join: Join, broker: Broker
+):
+    peer = join("peer")
+    for number in range(50):
+        peer.publish(f"kept/{number}", b"x", 1, retain=True)
+
+    class Prompt(InsideLink):
+        received: ClassVar[list[str]] = []
+
+        def publish(self, message, qos, packet_id, *_):  # type: ignore[no-untyped-def]
+            self.received.append(message.topic)
+            inside.puback(packet_id)
+
+    link = Prompt()
+    inside = broker.attach("inside", link)
+    for name in ("kept/#", "kept/+"):
+        broker.subscribe(inside, Subscription(name, 1))
+        broker.send_retained(inside, Subscription(name, 1), True)
+    while inside.replays:
+        inside.take_turn()
+    assert sorted(link.received) == sorted(2 * [f"kept/{number}" for number in range(50)])
+    for name in ("kept/#", "kept/+"):
+        broker.unsubscribe(inside, name)
