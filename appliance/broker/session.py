@@ -30,6 +30,9 @@ REPLAYED_PER_TURN = 512
 REPLAY_COST = 2
 REPLAYS_PER_COST_UNIT = 8
 
+#: Messages of a session that are looked at for one unit of cost: whether others may have them.
+PASSED_PER_COST_UNIT = 16
+
 #: The size, in bytes, above which a message is large: an image or a map, not a state or a command.
 #: A slow client gets large QoS 0 messages after everything else, see `Link.is_behind`.
 LARGE_MESSAGE = 32 * 1024
@@ -966,6 +969,8 @@ class Session:
             share = delivery[4]
             return share is not None and (shares is None or share in shares) and give(delivery)
 
+        waiting = len(self.queue) + len(self.inflight)
+        self.accounting.counters.cost += waiting // PASSED_PER_COST_UNIT
         if sent:
             for packet_id, delivery in list(self.inflight.items()):
                 if delivery is not None and delivery[1] == 1 and is_given(delivery):

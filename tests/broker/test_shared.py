@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from time import thread_time
 
 import pytest
 
+import appliance.broker.broker as broker_module
 from appliance.access import Acl
 from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Limits
+from appliance.broker.message import Message
 from appliance.broker.routing import CACHED_TOPIC
-from appliance.broker.shared import MAXIMUM_CHECKED
+from appliance.broker.session import Session
+from appliance.broker.shared import MAXIMUM_CHECKED, Share, Target
 from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Publish
+from appliance.mqtt.packets import Publish, Subscription
+from appliance.store import MemoryStore
 
-from .conftest import FakeAccess, Join, Peer, lasting
+from .conftest import FakeAccess, Join, Peer, check_accounts, lasting
 
 
 def publish(publisher, count: int, qos: int = 1) -> None:
@@ -295,3 +301,120 @@ def _count_questions(access: FakeAccess) -> Counter[str]:
 
     access.decide = counted  # type: ignore[method-assign]
     return asked
+
+
+class _AsksAll:
+    """The slow twin of what chooses who gets the messages that a member leaves."""
+
+    def __init__(self, share: Share, members: list[Target]) -> None:
+        self.share, self.members, self.checked = share, members, 0
+
+    def choose(self, message: Message, may_receive: Callable[[Session, str], bool]):
+        return self.share.choose(self.members, message, may_receive)
+
+
+def _handed_over(seed: int) -> list[object]:
+    """Who has which messages after members of groups have left again and again."""
+    rng = random.Random(seed)
+    access = FakeAccess()
+    limits = Limits(
+        queue_messages=rng.choice((4, 30)),
+        queue_bytes=rng.choice((20_000, 60_000)),
+        inflight=2,
+        queue_full=rng.choice(("refuse", "drop-oldest")),
+    )
+    broker = Broker(access, MemoryStore(), limits)
+    broker.tick(1.0)
+    publisher = Peer(broker)
+    publisher.connect("publisher")
+    names = [f"m{number}" for number in range(rng.choice((2, 7, 40)))]
+    for name in names:
+        access.deny(name, Action.RECEIVE, f"a/{rng.randrange(6)}")
+    # Sizes that differ by less than a quarter count as the same: see `_Heirs`.
+    sizes = rng.choice(((1,), (1, 4000), (1, 1500, 4000, 12_000)))
+    peers: dict[str, Peer] = {}
+    log: list[object] = []
+    for _ in range(150):
+        name = rng.choice(names)
+        peer = peers.get(name)
+        if peer is None:
+            peer = peers[name] = Peer(broker)
+            peer.connect(name, user=name, **lasting(5, rng.choice((0, 60))))
+        match rng.randrange(10):
+            case 0 | 1:
+                for group in "gh":
+                    wanted = Subscription(f"$share/{group}/a/#", rng.randint(0, 2))
+                    broker.subscribe(peer.session, wanted)
+            case 2:
+                broker.unsubscribe(peer.session, f"$share/{rng.choice('gh')}/a/#")
+            case 3:
+                peers.pop(name).lose()
+            case 4:
+                rng.choice((peer.slow, peer.fast))()
+            case 5:
+                for packet_id, delivery in list(peer.session.inflight.items()):
+                    if delivery is not None and delivery[1] == 1:
+                        peer.session.puback(packet_id)
+            case _:
+                for _ in range(rng.choice((1, 20))):
+                    message = Message(
+                        f"a/{rng.randrange(6)}",
+                        b"%d" % len(log) * rng.choice(sizes),
+                        rng.randint(1, 2),
+                    )
+                    broker.publish(message, publisher.session)
+                broker.flush()
+        for each, session in broker.sessions.items():
+            waiting = [d[0].payload for d in (*session.queue, *session.latest.values())]
+            sent = [d and d[0].payload for d in session.inflight.values()]
+            log.append((each, waiting, sent, session.bytes))
+        log.append({name: share._next for name, share in broker.router.shares.items()})
+    check_accounts(broker)
+    assert not broker.faults.count
+    return log
+
+
+@pytest.mark.patches
+@pytest.mark.parametrize("seed", range(12))
+def test_what_a_member_leaves_goes_to_those_whom_the_slow_way_finds(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+):
+    quick = _handed_over(seed)
+    monkeypatch.setattr("appliance.broker.broker._Heirs", _AsksAll)
+    assert quick == _handed_over(seed)
+
+
+@pytest.mark.patches
+@pytest.mark.parametrize("limits", [Limits(queue_messages=100, inflight=1)])
+@pytest.mark.parametrize("room", [False, True], ids=["full", "busy"])
+@pytest.mark.parametrize("sizes", [[10], range(4000, 0, -40)], ids=["alike", "shrinking"])
+def test_to_leave_takes_members_and_messages_and_not_their_product(
+    join: Join, broker: Broker, monkeypatch: pytest.MonkeyPatch, sizes: Sequence[int], room: bool
+):
+    """Whether none of many members has room, or each has and can send nothing at once."""
+    leaving = join("leaving")
+    leaving.subscribe("$share/g/a", 1)
+    publisher = join("publisher")
+    messages = 100
+    for number in range(messages + 1):
+        size = sizes[number % len(sizes)]
+        assert publisher.publish("a", bytes(size), 1) == 0
+    members = [join(f"m{number}") for number in range(MAXIMUM_CHECKED)]
+    for member in members:
+        member.subscribe("$share/g/a", 1)
+        for _ in range(1 if room else 101):
+            member.session.deliver(Message("own", b"", 1), 1, False, None)
+    looked = Counter[str]()
+    rank = broker_module._rank
+
+    def counted(member: Target) -> int:
+        looked["members"] += 1
+        return rank(member)
+
+    monkeypatch.setattr(broker_module, "_rank", counted)
+    begun = broker.counters.cost
+    assert broker.unsubscribe(leaving.session, "$share/g/a") == 0
+    assert len(leaving.session.queue) == (0 if room else messages)
+    kinds = 1 if len(sizes) == 1 else 20  # sizes that are told apart
+    assert looked["members"] <= 2 * kinds * len(members) + messages < len(members) * messages
+    assert messages <= broker.counters.cost - begun <= 2 * messages + kinds * len(members)
