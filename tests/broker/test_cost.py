@@ -191,6 +191,7 @@ def test_a_long_topic_behind_an_alias_costs_what_it_takes(join: Join, broker: Br
     assert costs[1] - costs[0] >= (60_000 + 19 * 60_000 // 16) >> 8
 
 
+@pytest.mark.patches
 def test_an_alias_is_checked_where_it_is_given(join: Join, monkeypatch: pytest.MonkeyPatch):
     checked = []
     monkeypatch.setattr(framing, "check_topic", checked.append)
@@ -213,6 +214,7 @@ def test_long_filters_cost_what_they_take(join: Join, broker: Broker, beginning:
     assert costs[1] - costs[0] >= 4 * (60_000 // LONG_FILTER)
 
 
+@pytest.mark.patches
 def test_a_thousand_identifiers_are_encoded_once_for_a_route(
     join: Join, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ):
@@ -272,6 +274,7 @@ def test_a_search_for_retained_messages_costs_though_none_is_found(join: Join, b
     assert broker.counters.cost - begun >= 2 * (nodes // STEP)
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("qos", [1, 2])
 def test_an_acknowledgement_looks_only_at_the_replay_that_it_makes_room_for(
     join: Join, broker: Broker, qos: int

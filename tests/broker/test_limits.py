@@ -146,6 +146,7 @@ class Watched(deque[Delivery]):
         return super().__iter__()
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("limits", [Limits(queue_full="drop-oldest", **SMALL)])
 def test_a_message_that_takes_the_place_of_the_oldest_looks_at_no_other(join: Join):
     subscriber = join("subscriber", **lasting(5))
