@@ -39,7 +39,12 @@ def stored(page: Any) -> dict[str, str]:
 
 def reload(visited: Visit, place: str) -> None:
     """Load the page again until that is there."""
-    visited.page.reload()
+    try:
+        visited.page.reload()
+    except sync_api.Error as error:
+        # The browser's own page about an error loads again by itself, now and then just now.
+        if "ERR_ABORTED" not in str(error):
+            raise
     visited.page.wait_for_selector(place)
 
 
