@@ -10,7 +10,6 @@ import heapq
 import itertools
 import logging
 import math
-from bisect import bisect_left, insort
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
@@ -28,7 +27,7 @@ from appliance.broker.rate_limited_log import RateLimitedLog
 from appliance.broker.retained import RetainedMessages
 from appliance.broker.routing import Fanout, Router
 from appliance.broker.session import Session, SessionAccounting, subscription_size
-from appliance.broker.shared import MAXIMUM_CHECKED, Share, Target
+from appliance.broker.shared import Heirs, Share, Target
 from appliance.broker.store import Store
 from appliance.broker.values import INSIDE, Action, Identity, PublishRejection
 from appliance.mqtt.codec import quote
@@ -107,77 +106,6 @@ def _has_all(account: Account, held: int, what: str) -> ProtocolError:
 def _all_taken(account: Account, held: int, what: str, limit: int) -> ProtocolError:
     text = f"all {limit} {what} are in use (broker.limits.{what}); {account} has {held} of them"
     return ProtocolError(ReasonCode.QUOTA_EXCEEDED, text)
-
-
-class _Heirs:
-    """The members of a group while messages that another one leaves are passed on to them.
-
-    `choose` finds the one that `Share.choose` would find among up to MAXIMUM_CHECKED members. While
-    messages are handed over no member gets room or becomes ready. So one that has refused a message
-    is not asked again for any of about that size, and one that is not ready any more is looked for
-    among the others: all messages together take members and messages, and not their product.
-    """
-
-    __slots__ = ("_by_size", "_members", "_share", "checked")
-
-    def __init__(self, share: Share, members: list[Target]) -> None:
-        self._share = share
-        self._members = members
-        #: By size, the indexes of members that may have room, by their rank (see `_rank`), sorted.
-        self._by_size: dict[int, list[list[int]]] = {}
-        #: Members that the last `choose` looked at.
-        self.checked = 0
-
-    def choose(
-        self, message: Message, may_receive: Callable[[Session, str], bool]
-    ) -> Target | None:
-        """The member that gets the message, round robin; None when no member can take it."""
-        # Four sizes from each power of two to the next: to tell all sizes apart would take as many
-        # checks as there are sizes, for each member.
-        shift = max(message.size.bit_length() - 3, 0)
-        size = message.size >> shift << shift
-        self.checked = 0
-        ranked = self._by_size.get(size)
-        if ranked is None:
-            ranked = self._by_size[size] = [[], [], [], []]
-            for index, member in enumerate(self._members):
-                ranked[_rank(member)].append(index)
-            self.checked = len(self._members)
-        share = self._share
-        count = len(self._members)
-        forbidden = 0
-        for rank in (3, 2, 1):
-            candidates = ranked[rank]
-            position = bisect_left(candidates, share._next % count) if candidates else 0
-            for _ in range(len(candidates)):
-                self.checked += 1
-                position %= len(candidates)
-                index = candidates[position]
-                member = self._members[index]
-                session = member[0]
-                rank_now = _rank(member)
-                if rank_now < rank:
-                    del candidates[position]
-                    insort(ranked[rank_now], index)
-                elif member[1] and not session.has_room(message):
-                    del candidates[position]
-                elif may_receive(session, message.topic):
-                    share._next = (index + 1) % count
-                    return member
-                else:
-                    position += 1
-                    forbidden += 1
-                    if forbidden >= MAXIMUM_CHECKED:
-                        return None
-        return None
-
-
-def _rank(member: Target) -> int:
-    """3 for one that can send a message of QoS 1 or 2, 2 if connected, 1 if it is kept, else 0."""
-    session, qos, _, _ = member
-    if session.link is None:
-        return 1 if qos and session.persistent else 0
-    return 3 if session.ready else 2
 
 
 class Broker:
@@ -565,7 +493,7 @@ class Broker:
 
     def _giver(self, *, absent_too: bool) -> Callable[[Delivery], bool]:
         """Return a function that delivers a message to another member; True if that succeeded."""
-        known: dict[Share, _Heirs] = {}
+        known: dict[Share, Heirs] = {}
 
         def give(delivery: Delivery) -> bool:
             message, _, _, _, share = delivery
@@ -578,7 +506,7 @@ class Broker:
                 self.counters.cost += len(members) // CHECKS_PER_COST_UNIT
                 if not absent_too:
                     members = [member for member in members if member[0].link is not None]
-                heirs = known[share] = _Heirs(share, members)
+                heirs = known[share] = Heirs(share, members)
             # Only candidates are checked against the rules: a group may have thousands of members.
             target = heirs.choose(message, self.router.may_receive)
             self.counters.cost += 1 + heirs.checked // CHECKS_PER_COST_UNIT

@@ -22,8 +22,8 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 #: Retained messages that are sent or skipped for new subscriptions in one turn of the event loop:
-#: some milliseconds, then it is the turn of other clients.
-REPLAYED_PER_TURN = 512
+#: some milliseconds, half of a turn, then it is the turn of other clients.
+REPLAYED_PER_TURN = 224
 
 #: The cost of one of these, which may be a step of the search for them. REPLAYS_PER_COST_UNIT
 #: replays that are looked at, and cannot go on, add one unit.

@@ -11,8 +11,8 @@ from time import thread_time
 
 import pytest
 
-import appliance.broker.broker as broker_module
 from appliance.access import Acl
+from appliance.broker import shared
 from appliance.broker.broker import Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Limits
@@ -330,7 +330,7 @@ def _handed_over(seed: int) -> list[object]:
     names = [f"m{number}" for number in range(rng.choice((2, 7, 40)))]
     for name in names:
         access.deny(name, Action.RECEIVE, f"a/{rng.randrange(6)}")
-    # Sizes that differ by less than a quarter count as the same: see `_Heirs`.
+    # Sizes that differ by less than a quarter count as the same: see `Heirs`.
     sizes = rng.choice(((1,), (1, 4000), (1, 1500, 4000, 12_000)))
     peers: dict[str, Peer] = {}
     log: list[object] = []
@@ -380,7 +380,7 @@ def test_what_a_member_leaves_goes_to_those_whom_the_slow_way_finds(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ):
     quick = _handed_over(seed)
-    monkeypatch.setattr("appliance.broker.broker._Heirs", _AsksAll)
+    monkeypatch.setattr("appliance.broker.broker.Heirs", _AsksAll)
     assert quick == _handed_over(seed)
 
 
@@ -405,13 +405,13 @@ def test_to_leave_takes_members_and_messages_and_not_their_product(
         for _ in range(1 if room else 101):
             member.session.deliver(Message("own", b"", 1), 1, False, None)
     looked = Counter[str]()
-    rank = broker_module._rank
+    rank = shared._rank
 
-    def counted(member: Target) -> int:
+    def counted(session: Session, qos: int) -> int:
         looked["members"] += 1
-        return rank(member)
+        return rank(session, qos)
 
-    monkeypatch.setattr(broker_module, "_rank", counted)
+    monkeypatch.setattr(shared, "_rank", counted)
     begun = broker.counters.cost
     assert broker.unsubscribe(leaving.session, "$share/g/a") == 0
     assert len(leaving.session.queue) == (0 if room else messages)
