@@ -20,6 +20,9 @@ _SHARE: Final = "$share/"
 STEP: Final = 16
 """Nodes of a tree that are visited in one step of a search."""
 
+LISTED_PER_STEP: Final = 128
+"""Children of a node that are listed for wildcards in the time of one."""
+
 
 # Control characters and non-characters: the standard leaves them to the receiver (section 1.5.3;
 # 5.0 section 1.5.4). A name that cannot be printed is useless, and misleading in a log.
@@ -327,6 +330,10 @@ class TopicTree(Generic[V]):
                     yield node.entry
                 continue
             level = levels[depth]
+            if node.listing is None and level in ("#", "+"):
+                # As many steps as it takes to list them, which is done anew after each new topic.
+                for _ in range(len(node.children) // LISTED_PER_STEP):
+                    yield None
             if level == "#":
                 if node.entry is not None:
                     yield node.entry

@@ -371,7 +371,7 @@ class Backlog:
         return self._eviction.is_owing
 
     def drop_more(self) -> None:
-        """Drop more of what large messages have displaced, a part; to be called in later turns."""
+        """Drop more of what is too old or displaced, a part; to be called in later turns."""
         self._eviction.go_on()
 
     def _queue_of(self, rule: OutRule, now: float) -> RuleQueue:
@@ -451,11 +451,10 @@ class Backlog:
     # --- too old ----------------------------------------------------------------------------------
 
     def tick(self, now: float) -> None:
-        """Drop what has become too old; to be called every second or so."""
+        """Drop what has become too old, the rest of much in later turns; to be called every second
+        or so."""
         self._log.tick(now)
-        self._eviction.drop_outdated(now)
-        self._eviction.go_on()
-        self._live.drop_outdated(self._queues.by_name.values(), now)
+        self._eviction.tick(now)
         if self._queues.forget_drained():
             self._sort()
         self._eviction.say_room()
@@ -961,8 +960,7 @@ class Backlog:
             if not _is_kept(entry):
                 self._discard(entry, DropReason.OFFLINE)
         for queue in self._queues.by_name.values():
-            while queue.live:
-                self._eviction.drop_first_live(queue, DropReason.OFFLINE)
+            self._live.forget(queue)
 
     def _put_back(self, entry: Entry) -> None:
         """It is not in flight any more, and is sent again before all others of its rule."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from appliance.broker.backlogs import Segment
 from appliance.upstream.backlog_counts import DropReason, Tally, too_old
-from appliance.upstream.live_messages import LIVE_SIZE, LiveMessages
+from appliance.upstream.live_messages import DROP_COST, LIVE_SIZE, LiveMessages
 from appliance.upstream.read_ahead import ReadAhead
 from appliance.upstream.records import record_times
 from appliance.upstream.rule_queue import Entry, RuleQueue
@@ -18,14 +18,13 @@ from appliance.upstream.rules import PRIORITIES, BacklogLimits
 
 log = logging.getLogger(__name__)
 
-#: The work of dropping one message, in units of `Counters.cost`, and the rules that are looked at
-#: for one unit more.
-DROP_COST: Final = 2
+#: The rules that are looked at for one unit of `Counters.cost` more than the work of dropping.
 RULES_PER_COST_UNIT: Final = 2
 
 #: The work that is done in one piece. A large message may displace tens of thousands of small ones,
-#: and their broker does nothing else meanwhile: it waits already while the others are dropped in
-#: later turns. What is not `Final` here tests replace, also in the compiled build.
+#: and as many may expire at once, while their broker does nothing else: the others are dropped in
+#: later turns, and a message waits already. What is not `Final` here tests replace, also in the
+#: compiled build.
 MOST_AT_ONCE = 1000
 
 #: By this part more than its size may wait meanwhile, and in any case one message.
@@ -69,6 +68,8 @@ class Eviction:
         #: and of what is forgotten with the connection; and how much of the latter may stay.
         self._owed_to = self._live_owed_to = _NOBODY
         self._live_limit = LIVE_SIZE
+        #: The time up to which more is too old than could be dropped so far.
+        self._outdated_at: float | None = None
 
     def use(self, limits: BacklogLimits) -> None:
         """Follow other limits from now on."""
@@ -85,14 +86,16 @@ class Eviction:
         limit = self._limits.size
         if size > limit:
             return False
-        self.drop_outdated(now)
+        is_all = self._drop_outdated(now)
         before = self._tally.bytes
         if before + size <= limit:
             return True
         if self._limits.when_full == "refuse":
             return False
         self.say_full()
-        is_all = self._drop_down_to(max(limit, before) - size, lane)
+        # What is too old goes first, also in later turns, if the message may wait meanwhile.
+        if is_all or not _may_owe(before, before + size, limit, is_all=False):
+            is_all = self._drop_down_to(max(limit, before) - size, lane)
         after = self._tally.bytes + size
         if after > limit:
             if not _may_owe(before, after, limit, is_all=is_all):
@@ -122,13 +125,30 @@ class Eviction:
     @property
     def is_owing(self) -> bool:
         """Whether `go_on` has something to do."""
-        return self._owed_to != _NOBODY or self._live_owed_to != _NOBODY
+        return (
+            self._owed_to != _NOBODY
+            or self._live_owed_to != _NOBODY
+            or self._outdated_at is not None
+            or self._live.is_looking
+        )
+
+    def tick(self, now: float) -> None:
+        """Drop what has become too old, a part if that is much; to be called every second or so."""
+        self._outdated_at = now
+        self._live.look_for_outdated(self._queues.by_name.values(), now)
+        self.go_on()
 
     def go_on(self) -> None:
-        """Drop more of what was displaced by messages that wait already.
+        """Drop more of what is too old, then of what was displaced by messages that wait already.
 
         Without anything else in their lanes and below, that is they themselves in the end.
         """
+        end = self.work + MOST_AT_ONCE
+        if self._outdated_at is not None and not self._drop_outdated(self._outdated_at):
+            return
+        self.work += self._live.drop_outdated(end - self.work)
+        if self.work >= end:
+            return
         if self._owed_to != _NOBODY and self._drop_down_to(self._limits.size, self._owed_to):
             self._owed_to = _NOBODY
         if self._live_owed_to != _NOBODY and self._drop_live_down_to(
@@ -163,7 +183,7 @@ class Eviction:
                 if not waiting:
                     break
                 oldest = min(waiting, key=lambda queue: record_times(queue.live[0])[0])
-                self.drop_first_live(oldest, DropReason.FULL)
+                self._drop_first_live(oldest, DropReason.FULL)
         return True
 
     def drop_oldest_latest(self, lane: int) -> bool:
@@ -221,14 +241,24 @@ class Eviction:
         _, stored_at, expires_at = record_times(data)
         return too_old(stored_at, expires_at, self._limits.age, now)
 
-    def drop_outdated(self, now: float) -> None:
+    def _drop_outdated(self, now: float) -> bool:
         """Drop what is too old or expired, from the front of each rule's journal and of what is
-        forgotten with the connection."""
+        forgotten with the connection; False when that is more than may be in one piece."""
+        end = self.work + MOST_AT_ONCE
+        self._outdated_at = now
         for queue in self._queues.by_name.values():
             while (reason := self._why_first(queue, now)) is not None:
+                if self.work >= end:
+                    return False
+                self.work += DROP_COST
                 self._drop_first_stored(queue, reason)
             while queue.live and (reason := self.why(queue.live[0], now)):
-                self.drop_first_live(queue, reason)
+                if self.work >= end:
+                    return False
+                self.work += DROP_COST
+                self._drop_first_live(queue, reason)
+        self._outdated_at = None
+        return True
 
     def _why_first(self, queue: RuleQueue, now: float) -> DropReason | None:
         """Why the first one in the journal is not to be sent any more, if so."""
@@ -264,12 +294,12 @@ class Eviction:
         if value is not None:
             self._live.drop(found, value, DropReason.FULL)
         elif is_live:
-            self.drop_first_live(found, DropReason.FULL)
+            self._drop_first_live(found, DropReason.FULL)
         else:
             self._drop_first_stored(found, DropReason.FULL)
         return True
 
-    def drop_first_live(self, queue: RuleQueue, reason: DropReason) -> None:
+    def _drop_first_live(self, queue: RuleQueue, reason: DropReason) -> None:
         """Drop the first one that is forgotten with the connection."""
         data = self._live.pop(queue)
         self._tally.remove(queue, len(data))

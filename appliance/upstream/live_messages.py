@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Final
 
@@ -47,6 +47,11 @@ TOPICS_SIZE = 32 * MIB
 VALUES_SIZE = 256 * KIB
 VALUES_AT_ONCE: Final = 32
 
+#: The work of dropping one message that is too old, in units of `Counters.cost`, and the messages
+#: that are looked at for one unit more.
+DROP_COST: Final = 2
+LOOKED_AT_PER_COST_UNIT: Final = 32
+
 
 class LiveMessages:
     """The messages of all rules of a link that are in `latest` and `live`.
@@ -82,6 +87,9 @@ class LiveMessages:
         self._topic_shares = UserShares(TOPICS_SIZE)
         #: No latest message expires before.
         self._earliest_end = math.inf
+        #: The latest messages that are still to be looked at, whether they are too old then.
+        self._outdated: Iterator[tuple[RuleQueue, LatestValue]] | None = None
+        self._outdated_at = 0.0
 
     def use(self, limits: BacklogLimits) -> None:
         """Follow other limits from now on."""
@@ -105,6 +113,14 @@ class LiveMessages:
         data = queue.live.popleft()
         self.memory -= len(data) + LOADED_OVERHEAD
         return data
+
+    def forget(self, queue: RuleQueue) -> None:
+        """The connection has ended. All at once, as there may be tens of thousands."""
+        count, size = len(queue.live), sum(map(len, queue.live))
+        queue.live.clear()
+        self.memory -= size + count * LOADED_OVERHEAD
+        self._tally.add(queue, -count, -size)
+        self._tally.drop(queue, DropReason.OFFLINE, count)
 
     # --- the latest of a topic --------------------------------------------------------------------
 
@@ -238,18 +254,38 @@ class LiveMessages:
         if single is not None:
             self._single.remove(single)
 
-    def drop_outdated(self, queues: Iterable[RuleQueue], now: float) -> None:
-        """Drop the latest messages that are too old or expired; most often there can be none."""
-        if self._earliest_end > now:
-            return
-        self._earliest_end = math.inf
-        for queue in queues:
-            for value in list(queue.latest):
-                reason = too_old(value.stored_at, value.expires_at, self._age, now)
+    def look_for_outdated(self, queues: Iterable[RuleQueue], now: float) -> None:
+        """Begin to look for latest messages that are too old or expired, which `drop_outdated`
+        drops; most often there can be none."""
+        if self._outdated is None and self._earliest_end <= now:
+            self._earliest_end = math.inf
+            self._outdated_at = now
+            self._outdated = iter([(queue, value) for queue in queues for value in queue.latest])
+
+    @property
+    def is_looking(self) -> bool:
+        """Whether `drop_outdated` has something to do."""
+        return self._outdated is not None
+
+    def drop_outdated(self, most: int) -> int:
+        """Look at more of them; returns the work, which is about so much at most."""
+        if self._outdated is None:
+            return 0
+        dropped = work = 0
+        for looked_at, (queue, value) in enumerate(self._outdated, 1):
+            if queue.latest.get(value.topic) is value:
+                reason = too_old(value.stored_at, value.expires_at, self._age, self._outdated_at)
                 if reason is not None:
                     self.drop(queue, value, reason)
+                    dropped += 1
                 else:
                     self._earliest_end = min(self._earliest_end, self._end_of(value))
+            work = DROP_COST * dropped + looked_at // LOOKED_AT_PER_COST_UNIT
+            if work >= most:
+                break
+        else:
+            self._outdated = None
+        return work
 
     def _end_of(self, value: LatestValue) -> float:
         """When it will be too old."""

@@ -86,7 +86,7 @@ class Offers(Protocol):
         """Whether `drop_more` has something to do."""
 
     def drop_more(self) -> None:
-        """Drop more of what large messages have displaced, a part."""
+        """Drop more of what is too old or displaced, a part."""
 
 
 @dataclass(slots=True)
@@ -165,7 +165,7 @@ class OutSession:
 
     def take_turn(self) -> None:
         """Continue with the retained messages, with filters whose rights were not decided, and with
-        what large messages have displaced."""
+        what the backlog drops."""
         session = self._session
         if session is None:
             return
@@ -174,11 +174,15 @@ class OutSession:
             work = backlog.work
             backlog.drop_more()
             self._broker.counters.cost += backlog.work - work
-            if backlog.is_owing:
-                self._later()
+            self.drop_later()
         if self._must_ask:
             self._subscribe(session)
         session.take_turn()
+
+    def drop_later(self) -> None:
+        """Let the backlog go on in a later turn, if it has more to drop."""
+        if self._session is not None and self._backlog.is_owing:
+            self._later()
 
     # --- subscriptions -------------------------------------------------------------------------
 
@@ -299,8 +303,7 @@ class OutSession:
                 user=self._user(message),
             )
             broker.counters.cost += backlog.work - work
-            if backlog.is_owing:
-                self._later()
+            self.drop_later()
             if backlog.is_behind_disk:
                 broker.disk.begin()
         except Exception:

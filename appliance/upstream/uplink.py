@@ -178,6 +178,7 @@ class Uplink:
 
     def _tick(self) -> None:
         self._backlog.tick(self._journal_clock())
+        self._out.drop_later()
         self._sender.tick()
         counts = self._backlog.counts()
         now = self._loop.time()

@@ -8,6 +8,7 @@ from itertools import product
 import pytest
 
 from appliance.mqtt.topics import (
+    LISTED_PER_STEP,
     SubscriptionTree,
     TopicTree,
     check_filter,
@@ -306,6 +307,26 @@ def test_find_bears_changes_meanwhile():
         tree.delete(f"a/{number}/x")
         tree.set(f"b/{number}", number)
     assert {topic for topic, _ in found} >= {f"a/{number}/x" for number in range(1, 50)}
+
+
+@pytest.mark.parametrize("topic_filter", ["a/+", "a/#", "a/+/b"])
+def test_to_list_the_children_of_a_level_is_counted_when_it_is_done(topic_filter):
+    tree: TopicTree[int] = TopicTree()
+    for number in range(1_000):
+        tree.set(f"a/{number}", number)
+
+    def steps() -> int:
+        return list(tree.find_in_steps(topic_filter)).count(None)
+
+    first, second = steps(), steps()
+    assert first == second + 1_000 // LISTED_PER_STEP
+    tree.set("a/new", 0)
+    assert steps() == first
+    assert steps() == second
+    # Before it is done: who goes away meanwhile has not paid, and nobody has waited.
+    tree.set("a/newer", 0)
+    assert next(tree.find_in_steps(topic_filter)) is None
+    assert tree._root.children["a"].listing is None
 
 
 def calls(function, *arguments) -> int:

@@ -18,8 +18,8 @@ from appliance.upstream.backlog import (
 )
 from appliance.upstream.backlog_counts import BacklogCounts, DropReason
 from appliance.upstream.disk_room import UNWRITTEN_AWAITED, UNWRITTEN_FROM_ROS, UNWRITTEN_SIZE
-from appliance.upstream.eviction import DROP_COST, MOST_AT_ONCE
-from appliance.upstream.live_messages import LATEST_SIZE, LIVE_SIZE
+from appliance.upstream.eviction import MOST_AT_ONCE
+from appliance.upstream.live_messages import DROP_COST, LATEST_SIZE, LIVE_SIZE
 from appliance.upstream.rule_queue import LOADED_OVERHEAD, Entry
 from appliance.upstream.rules import BacklogLimits, KeepRule, OutRule, Priority
 from appliance.upstream.set_aside import ASIDE_SIZE
@@ -552,6 +552,50 @@ def test_what_is_forgotten_is_displaced_in_pieces(size: int) -> None:
     assert sent[-1] == "x" * size
     assert [int(each) for each in sent[:-1]] == list(range(number - len(sent) + 1, number))
     assert (len(sent) == 1) == (size > LIVE_SIZE)
+
+
+@pytest.mark.parametrize("keep", ["all", "latest", "none"])
+def test_what_is_too_old_goes_in_pieces(keep: KeepRule) -> None:
+    link = Link(rule(keep=keep))
+    for number in range(5_000):
+        link.offer("old", f"{number}", expires_in=1.0)
+    link.offer("kept", "kept")
+    link.backlogs.time += 1
+    link.backlog.tick(link.backlogs.time)
+    assert (
+        0 < DROP_COST * link.dropped()["expired"] <= link.backlog.work <= MOST_AT_ONCE + DROP_COST
+    )
+    link.offer("newer", "newer")  # meanwhile
+    assert _drop_on(link) >= 8
+    assert link.dropped() == {"expired": 5_000}
+    assert link.drain() == ["kept", "newer"]
+
+
+def test_latest_ones_that_were_replaced_meanwhile_stay() -> None:
+    link = Link(rule(keep="latest"))
+    for number in range(2_000):
+        link.offer("old", f"{number}", expires_in=1.0)
+    link.backlogs.time += 1
+    link.backlog.tick(link.backlogs.time)
+    link.offer("new", "1999", expires_in=5.0)
+    _drop_on(link)
+    assert link.dropped() == {"expired": 1_999, "replaced": 1}
+    link.backlogs.time += 5
+    link.backlog.tick(link.backlogs.time)
+    assert link.dropped() == {"expired": 2_000, "replaced": 1}
+
+
+def test_full_of_what_is_too_old_nothing_else_goes() -> None:
+    link = Link(rule("h", "none", "high"), rule("l", priority="low"), size=1_000_000)
+    for number in range(2_900):
+        link.offer(f"{number:285}", f"{number}", expires_in=1.0)
+    link.offer("low", of=1)
+    link.backlogs.time += 1
+    assert link.offer("x" * 900_000) is None  # displaces more than goes in one piece
+    assert link.counts().bytes > 1_000_000 and link.backlog.work <= MOST_AT_ONCE
+    _drop_on(link)
+    assert link.dropped() == {"expired": 2_900}
+    assert link.drain() == ["x" * 900_000, "low"]
 
 
 @pytest.mark.parametrize("room", range(2, 14))
