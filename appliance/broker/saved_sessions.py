@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
@@ -93,9 +94,8 @@ def _left_at(entry: SavedSession) -> float:
 def _restore_deliveries(broker: Broker, entry: SavedSession) -> None:
     def delivery(pending: PendingDelivery) -> Delivery:
         share = broker.router.shares.get(pending.share) if pending.share is not None else None
-        return Delivery(
-            pending.message, pending.qos, pending.retain, pending.subscription_ids, share
-        )
+        ids = pending.subscription_ids
+        return cast(Delivery, (pending.message, pending.qos, pending.retain, ids, share))
 
     assert entry.session is not None
     entry.session.restore(

@@ -551,11 +551,11 @@ class Session:
         """Take over the messages that the store has for this session."""
         self.inflight.update(inflight)
         self.queue.extend(queue)
-        self.queue_bytes += sum(delivery[0].size for delivery in queue)
         self.received.update(received)
-        for delivery in (*inflight.values(), *queue):
-            if delivery is not None:
-                self._count(delivery[0])
+        in_flight = sum(each[0].size for each in inflight.values() if each is not None)
+        queued = sum(delivery[0].size for delivery in queue)
+        self.queue_bytes += queued
+        self.take(in_flight + queued)
         for held in received.values():
             self.take(held_size(held))
         self._last_packet_id = next(reversed(inflight), 0)

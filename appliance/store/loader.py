@@ -25,6 +25,7 @@ from appliance.mqtt.codec import (
     PacketType,
     Property,
     check_properties,
+    encode_string,
     encode_varint,
 )
 from appliance.mqtt.packets import Subscription
@@ -55,6 +56,9 @@ LARGEST_KEY = 1 << 53
 
 #: Seconds since 1970, later than every time that is stored: a larger number is damage.
 LATEST = 1e12
+
+#: Topics of messages that are known to be valid, with their encoding.
+KNOWN_TOPICS = 10_000
 
 
 @dataclass(slots=True)
@@ -115,7 +119,8 @@ def load(rows: Rows, offset: float) -> Loaded:
         nonlocal wrong
         for key in sorted(found):
             try:
-                _within(key, 1, LARGEST_KEY)
+                if not 1 <= key <= LARGEST_KEY:
+                    raise _WrongRowError(f"{key} is no key")
                 take(found[key])
             except (
                 _WrongRowError,
@@ -129,8 +134,10 @@ def load(rows: Rows, offset: float) -> Loaded:
                 wrong += 1
                 loaded.useless.append((table, key))
 
+    topics: dict[str, bytes] = {}
+
     def take_message(row: MessageRow) -> None:
-        loaded.messages[row.id], expiry = _message(row, offset)
+        loaded.messages[row.id], expiry = _message(row, offset, topics)
         if expiry is not None:
             loaded.expiries[row.id] = expiry
 
@@ -187,10 +194,9 @@ def _of(kind: type[_T], value: object) -> _T:
 
 
 def _within(value: object, low: int, high: int) -> int:
-    number = _of(int, value)
-    if not low <= number <= high:
-        raise _WrongRowError(f"{number} is out of range")
-    return number
+    if type(value) is not int or not low <= value <= high:
+        raise _WrongRowError(f"{value!r:.40} where a number from {low} to {high} belongs")
+    return value
 
 
 def _rate(value: object) -> float:
@@ -209,10 +215,20 @@ def _time(value: object, offset: float) -> float | None:
     return moment - offset
 
 
-def _message(row: MessageRow, offset: float) -> tuple[Message, int | None]:
-    """The message, and its message expiry interval if it was stored as a will."""
+def _message(
+    row: MessageRow, offset: float, topics: dict[str, bytes]
+) -> tuple[Message, int | None]:
+    """The message, and its message expiry interval if it was stored as a will.
+
+    Most messages have the topic of another one: `topics` saves to check and to encode it again.
+    """
     topic = _of(str, row.topic)
-    check_topic(topic)
+    topic_wire = topics.get(topic)
+    if topic_wire is None:
+        check_topic(topic)
+        if len(topics) >= KNOWN_TOPICS:
+            topics.clear()
+        topic_wire = topics[topic] = encode_string(topic)
     wire, expiry = NO_PROPERTIES, None
     if row.properties is not None:
         checked = _properties(_of(bytes, row.properties))
@@ -229,7 +245,8 @@ def _message(row: MessageRow, offset: float) -> tuple[Message, int | None]:
         _within(row.retain, 0, 1) == 1,
         None,
         _time(row.expires_at, offset),
-        properties_wire=wire,
+        topic_wire,
+        wire,
     )
     return message, expiry
 
@@ -283,8 +300,9 @@ def _take_subscription(row: SubscriptionRow, loaded: Loaded) -> None:
 def _take_owed(row: OwedRow, loaded: Loaded) -> None:
     session = loaded.sessions[_of(int, row.session)]
     saved = session.saved
-    packet_id = None if row.packet_id is None else _within(row.packet_id, 1, 0xFFFF)
+    packet_id = row.packet_id
     if packet_id is not None:
+        packet_id = _within(packet_id, 1, 0xFFFF)
         if packet_id in saved.inflight:
             raise _WrongRowError("a second message with one packet id")
         _within(row.sent, 1, LARGEST_KEY)

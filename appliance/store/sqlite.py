@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import cast
 
 from appliance.broker.broker import Broker
-from appliance.broker.delivery import Delivery
 from appliance.broker.saved_sessions import restore
 from appliance.net.callbacks import Entries, PeriodicCallback
 from appliance.store.clock import KEY, StoreClock, boot_id, stamp_of
@@ -136,6 +135,7 @@ class SqliteStore(StagingStore):
 
     def _restore_sessions(self, loaded: Loaded, rows: Rows) -> None:
         """Remember which rows the sessions have that the broker has restored."""
+        refer = self._messages.refer
         for entry in loaded.sessions.values():
             session = entry.saved.session
             assert session is not None
@@ -146,23 +146,19 @@ class SqliteStore(StagingStore):
                 if delivery is None:
                     stored.recorded[packet_id] = key
                 else:
-                    self._restore_owed(stored, key, delivery, cast(int, rows.owed[key].sent))
+                    stored.owed[id(delivery)] = key, delivery, cast(int, rows.owed[key].sent)
+                    refer(delivery[0], stored.account)
             for key, delivery in zip(entry.queue, session.queue, strict=True):
-                self._restore_owed(stored, key, delivery, None)
+                stored.owed[id(delivery)] = key, delivery, None
+                refer(delivery[0], stored.account)
             for packet_id, held in session.received.items():
                 stored.received[packet_id] = entry.received[packet_id], held.message
-                self._messages.refer(held.message, stored.account)
+                refer(held.message, stored.account)
             if entry.saved.will is not None:
                 stored.will = entry.saved.will.message
-                self._messages.refer(stored.will, stored.account)
+                refer(stored.will, stored.account)
             if entry.saved.ends_at is None:  # it expires from now on, also after further restarts
                 self._put_session(session, stored)
-
-    def _restore_owed(
-        self, stored: StoredSession, key: int, delivery: Delivery, sent: int | None
-    ) -> None:
-        stored.owed[id(delivery)] = key, delivery, sent
-        self._messages.refer(delivery[0], stored.account)
 
     async def close(self) -> None:
         """See `SessionStore`."""
