@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import signal
@@ -38,9 +37,11 @@ async def running(script: str, delay: float = 0.01) -> AsyncIterator[AnnouncerPr
     try:
         yield process
     finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        # As the appliance does: asyncio waits for good for the end of a process that was cancelled
+        # before its pipes were connected.
+        while not task.done():
+            task.cancel()
+            await asyncio.wait({task}, timeout=1)
 
 
 class Told:

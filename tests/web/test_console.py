@@ -21,6 +21,9 @@ VENDOR = FILES / "vendor"
 MANIFEST: dict[str, dict[str, Any]] = json.loads((VENDOR / "manifest.json").read_text())
 OWN = sorted(path.name for path in FILES.glob("*.js"))
 
+#: Seconds for node, which tries tens of thousands of payloads.
+NODE_PATIENCE = 4 * PATIENCE
+
 #: What the first page may take, see docs/http.md.
 FIRST_BYTES = 250 * 1024
 FIRST_REQUESTS = 12
@@ -166,7 +169,7 @@ def test_a_module_has_no_error_of_syntax(name: str):
     """Before a browser is started: a page whose modules do not load says nothing."""
     with (FILES / name).open() as module:
         command = ["node", "--input-type=module", "--check", "-"]
-        done = subprocess.run(command, stdin=module, capture_output=True, timeout=PATIENCE)
+        done = subprocess.run(command, stdin=module, capture_output=True, timeout=NODE_PATIENCE)
     assert done.returncode == 0, done.stderr.decode()
 
 
@@ -181,7 +184,7 @@ def test_hostile_payloads(name: str):
         ["node", str(Path(__file__).parent / f"{name}.js"), tested.as_uri()],
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
+        timeout=NODE_PATIENCE,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "ok\n"
