@@ -26,6 +26,9 @@ PAGE_SIZE: Final = 256 * 1024
 MOST_SUBSCRIPTIONS: Final = 20
 MOST_OF_ONE: Final = 1000
 
+#: The most characters of a text that is searched: each session is compared with it.
+LONGEST_SEARCH: Final = 256
+
 #: The bytes of an entry beside its names, about.
 _ENTRY_SIZE: Final = 400
 
@@ -45,7 +48,7 @@ class ListClients(Arguments):
     client: Name | None = None
     user: Name | None = None
     connected: bool | None = None
-    search: Name | None = None
+    search: Annotated[str, Field(max_length=LONGEST_SEARCH)] | None = None
     after: Name | None = None
     limit: Annotated[int, Field(ge=1, le=MOST_CLIENTS)] = 100
 

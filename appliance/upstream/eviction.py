@@ -90,8 +90,8 @@ class Eviction:
         before = self._tally.bytes
         if before + size <= limit:
             return True
-        if self._limits.when_full == "refuse":
-            return False
+        if self._limits.when_full == "refuse":  # nothing but what is too old makes room for it
+            return not is_all and _may_owe(before, before + size, limit, is_all=False)
         self.say_full()
         # What is too old goes first, also in later turns, if the message may wait meanwhile.
         if is_all or not _may_owe(before, before + size, limit, is_all=False):

@@ -177,7 +177,9 @@ class Uplink:
         self.broker.flush()
 
     def _tick(self) -> None:
+        work = self._backlog.work
         self._backlog.tick(self._journal_clock())
+        self.broker.counters.cost += self._backlog.work - work
         self._out.drop_later()
         self._sender.tick()
         counts = self._backlog.counts()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import contextlib
 import socket
 import ssl
 from collections.abc import Callable
@@ -31,6 +32,9 @@ PATH: Final = "/api/v1"
 
 #: The most bytes of a body: larger messages are for MQTT, which takes them in portions.
 LONGEST: Final = 1024 * 1024
+
+#: The most bytes of an error that is an answer to a call, if its code is to be the status.
+LONGEST_ERROR: Final = 16 * 1024
 
 #: The most work that the values of a body may be, in the unit of `Cost`: of lists and objects a few
 #: bytes are as much as a hundred of text, and everybody waits while they are read.
@@ -203,11 +207,16 @@ async def _called(
         return _error(504, "timeout", f"no answer from {topic} within {patience:g} s")
     if user_properties(answer).get("status") != "error":
         return HttpResponse(200, answer.payload, JSON)
-    try:
-        code = orjson.loads(answer.payload)["error"]["code"]
-    except (ValueError, LookupError, TypeError):
-        code = ""
-    return HttpResponse(_CALL_STATUS.get(code, 502), answer.payload, JSON)
+    return HttpResponse(_status_of(answer.payload), answer.payload, JSON)
+
+
+def _status_of(error: bytes) -> int:
+    """The status for an answer that says what went wrong. Whoever may answer has written it."""
+    code = None
+    if len(error) <= LONGEST_ERROR:  # everybody waits while it is read
+        with contextlib.suppress(ValueError, LookupError, TypeError):
+            code = orjson.loads(error)["error"]["code"]
+    return _CALL_STATUS.get(code, 502) if isinstance(code, str) else 502
 
 
 def _message(wanted: dict[str, Any]) -> Publish:

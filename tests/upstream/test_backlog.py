@@ -598,6 +598,19 @@ def test_full_of_what_is_too_old_nothing_else_goes() -> None:
     assert link.drain() == ["x" * 900_000, "low"]
 
 
+def test_full_of_what_is_too_old_nothing_is_refused() -> None:
+    link = Link(rule(keep="none"), size=1_000_000, when_full="refuse")
+    for number in range(2_900):
+        link.offer(f"{number:285}", f"{number}", expires_in=1.0)
+    assert link.offer("x" * 900_000) is not None
+    link.backlogs.time += 1
+    assert link.offer("x" * 900_000) is None
+    _drop_on(link)
+    assert link.dropped() == {"expired": 2_900, "refused": 1}
+    assert link.counts().bytes <= 1_000_000
+    assert link.offer("y" * 900_000) is not None
+
+
 @pytest.mark.parametrize("room", range(2, 14))
 @pytest.mark.parametrize("behind", range(4))
 def test_what_is_on_the_way_into_memory_is_not_merged_on_the_disk(
