@@ -82,13 +82,14 @@ class ClientVerbs:
 
     async def _list(self, caller: Caller, wanted: ListClients) -> dict[str, Any]:
         sessions = self._broker.sessions
-        looked = _LOOKED_PER_COST_UNIT if not wanted.search else _SEARCHED_PER_COST_UNIT
+        searched = (wanted.search or "").lower()
+        looked = _LOOKED_PER_COST_UNIT if not searched else _SEARCHED_PER_COST_UNIT
         self._broker.counters.cost += len(sessions) // looked
         if wanted.client is not None:
             one = sessions.get(wanted.client)
-            found = [one] if one is not None and _matches(one, wanted) else []
+            found = [one] if one is not None and _matches(one, wanted, searched) else []
         else:
-            matching = (each for each in sessions.values() if _matches(each, wanted))
+            matching = (each for each in sessions.values() if _matches(each, wanted, searched))
             found = heapq.nsmallest(wanted.limit + 1, matching, key=lambda each: each.client_id)
         most = MOST_SUBSCRIPTIONS if wanted.client is None else MOST_OF_ONE
         page: list[dict[str, Any]] = []
@@ -128,7 +129,8 @@ def _named(wanted: OneClient) -> dict[str, Any]:
     return {"of": wanted.client}
 
 
-def _matches(session: Session, wanted: ListClients) -> bool:
+def _matches(session: Session, wanted: ListClients, searched: str) -> bool:
+    """Whether a session is wanted; `searched` is the text that is searched, in lower case."""
     if session.is_inside:
         return False
     if wanted.after is not None and session.client_id <= wanted.after:
@@ -138,7 +140,7 @@ def _matches(session: Session, wanted: ListClients) -> bool:
     username = session.identity.username if session.identity is not None else None
     if wanted.user is not None and username != wanted.user:
         return False
-    return not wanted.search or wanted.search.lower() in _named_by(session, username).lower()
+    return not searched or searched in _named_by(session, username).lower()
 
 
 def _named_by(session: Session, username: str | None) -> str:

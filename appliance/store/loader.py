@@ -119,8 +119,7 @@ def load(rows: Rows, offset: float) -> Loaded:
         nonlocal wrong
         for key in sorted(found):
             try:
-                if not 1 <= key <= LARGEST_KEY:
-                    raise _WrongRowError(f"{key} is no key")
+                _within(key, 1, LARGEST_KEY)
                 take(found[key])
             except (
                 _WrongRowError,

@@ -21,10 +21,10 @@ log = logging.getLogger(__name__)
 #: The rules that are looked at for one unit of `Counters.cost` more than the work of dropping.
 RULES_PER_COST_UNIT: Final = 2
 
-#: The work that is done in one piece. A large message may displace tens of thousands of small ones,
-#: and as many may expire at once, while their broker does nothing else: the others are dropped in
-#: later turns, and a message waits already. What is not `Final` here tests replace, also in the
-#: compiled build.
+#: The work that is done in one piece, for what is too old and as much for what is displaced. A
+#: large message may displace tens of thousands of small ones, and as many may expire at once, while
+#: their broker does nothing else: the others are dropped in later turns, and a message waits
+#: already. What is not `Final` here tests replace, also in the compiled build.
 MOST_AT_ONCE = 1000
 
 #: By this part more than its size may wait meanwhile, and in any case one message.
@@ -90,11 +90,12 @@ class Eviction:
         before = self._tally.bytes
         if before + size <= limit:
             return True
-        if self._limits.when_full == "refuse":  # nothing but what is too old makes room for it
-            return not is_all and _may_owe(before, before + size, limit, is_all=False)
-        self.say_full()
         # What is too old goes first, also in later turns, if the message may wait meanwhile.
-        if is_all or not _may_owe(before, before + size, limit, is_all=False):
+        may_wait = not is_all and _may_owe(before, before + size, limit, is_all=False)
+        if self._limits.when_full == "refuse":  # nothing else makes room for it
+            return may_wait
+        self.say_full()
+        if not may_wait:
             is_all = self._drop_down_to(max(limit, before) - size, lane)
         after = self._tally.bytes + size
         if after > limit:

@@ -138,6 +138,8 @@ class OutSession:
         self._answering: Session | None = None
         #: Whether filters that are not subscribed to are asked about in the next turn.
         self._must_ask = False
+        #: The work of the backlog that is counted as the broker's.
+        self._counted = backlog.work
 
     def attach(self) -> None:
         """Subscribe here, and begin to offer the retained messages."""
@@ -171,16 +173,17 @@ class OutSession:
             return
         backlog = self._backlog
         if backlog.is_owing:
-            work = backlog.work
             backlog.drop_more()
-            self._broker.counters.cost += backlog.work - work
-            self.drop_later()
+            self.has_dropped()
         if self._must_ask:
             self._subscribe(session)
         session.take_turn()
 
-    def drop_later(self) -> None:
-        """Let the backlog go on in a later turn, if it has more to drop."""
+    def has_dropped(self) -> None:
+        """Count what the backlog has dropped; let it go on in a later turn if there is more."""
+        work = self._backlog.work
+        self._broker.counters.cost += work - self._counted
+        self._counted = work
         if self._session is not None and self._backlog.is_owing:
             self._later()
 
@@ -289,7 +292,6 @@ class OutSession:
         retain = message.retain if rule.retain is None else rule.retain
         try:
             topic, properties = self._properties(topic, message)
-            work = backlog.work
             refusal = backlog.offer(
                 rule,
                 topic,
@@ -302,8 +304,7 @@ class OutSession:
                 is_acknowledged=_is_acknowledged(publisher_of(message)),
                 user=self._user(message),
             )
-            broker.counters.cost += backlog.work - work
-            self.drop_later()
+            self.has_dropped()
             if backlog.is_behind_disk:
                 broker.disk.begin()
         except Exception:

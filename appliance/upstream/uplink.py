@@ -177,10 +177,8 @@ class Uplink:
         self.broker.flush()
 
     def _tick(self) -> None:
-        work = self._backlog.work
         self._backlog.tick(self._journal_clock())
-        self.broker.counters.cost += self._backlog.work - work
-        self._out.drop_later()
+        self._out.has_dropped()
         self._sender.tick()
         counts = self._backlog.counts()
         now = self._loop.time()

@@ -19,7 +19,7 @@ from web_app import WebApp
 from appliance.access import Passwords
 from appliance.broker.link import ReceivingLink
 from appliance.broker.message import Message
-from appliance.mqtt.codec import Property
+from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.web import api
@@ -190,6 +190,7 @@ async def test_calls(web: WebApp):
     assert status == 200 and [each["user"] for each in body["users"]] == ["admin", "viewer"]
     for wanted, expected, code in (
         (verb("clients", payload={"limit": 0}), 400, "bad_request"),
+        (verb("clients", payload={"search": "x" * 257}), 400, "bad_request"),
         (verb("disconnect", payload={"client": "x"}), 404, "not_found"),
         (verb("no-such-verb"), 403, "not_authorized"),
         ({"topic": "elsewhere/_call"}, 403, "not_authorized"),  # no right to read the answer
@@ -200,6 +201,45 @@ async def test_calls(web: WebApp):
     listen(web)  # somebody who does not answer
     status, _, body = await post(web, "call", {"topic": "r2d2/reset/_call", "timeout": 0.1})
     assert (status, body["error"]["code"]) == (504, "timeout")
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (b'{"error": {"code": "rejected", "message": "no"}}', 409),
+        (b'{"error": {"code": "its own"}}', 502),
+        (b'{"error": {"code": []}}', 502),
+        (b'{"error": {"code": null}}', 502),
+        (b'{"error": []}', 502),
+        (b"[]", 502),
+        (b"{", 502),
+        (b'{"error": {"code": "rejected"}}'.ljust(api.LONGEST_ERROR), 409),
+        (b'{"error": {"code": "rejected"}}'.ljust(api.LONGEST_ERROR + 1), 502),
+    ],
+)
+async def test_an_error_that_anybody_may_have_written(web: WebApp, error: bytes, expected: int):
+    broker = web.app.broker
+    loop = asyncio.get_running_loop()
+
+    def refuse(asked: Message, retain: bool, ids: list[int] | None) -> None:
+        reply = (asked.properties or {})[Property.RESPONSE_TOPIC]
+        properties: Properties = {Property.USER_PROPERTY: [("status", "error")]}
+        loop.call_soon(publish, Message(reply, error, 1, False, properties))
+
+    def publish(answer: Message) -> None:
+        broker.publish(answer, session)
+        broker.flush()
+
+    session = broker.attach("_test", ReceivingLink(refuse))
+    broker.subscribe(session, Subscription("r2d2/x/_call", 0))
+    peer = await web.dial()
+    body = b'{"topic": "r2d2/x/_call"}'
+    fields = {**basic(), "Content-Type": "application/json", "Content-Length": str(len(body))}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    head = f"POST /api/v1/call HTTP/1.1\r\nHost: localhost\r\n{lines}\r\n"
+    await peer.send(head.encode() + body)
+    status, _, content = await answer(peer)
+    assert (status, content) == (expected, error)  # the fixture sees that nothing was a fault
 
 
 GOOD = {"topic": "r2d2/a", "payload": 1}
