@@ -22,10 +22,10 @@ from appliance.management.enrolment import LONGEST_ENROLMENT, carry_out
 from appliance.management.phone_certificates import PhoneCertificates
 from appliance.management.verbs import Verbs
 from appliance.mqtt.reason import ReasonCode
-from appliance.net.http import HttpRequest, HttpResponse, text
+from appliance.net.http import RETRY_AFTER, HttpRequest, HttpResponse, text
 from appliance.ros.calls.dispatcher import CallError
 from appliance.web.authority import is_local
-from appliance.web.login import RETRY_AFTER, WebLogin, credentials
+from appliance.web.login import WebLogin, credentials
 from appliance.web.site import Resource
 
 #: The most seconds that a code waits because of wrong ones from its address.

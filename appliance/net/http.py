@@ -5,8 +5,12 @@ layer: the connection is that of an MQTT client from there on, as on a listener 
 
 A request is taken when the one before it was answered and its answer was read; until then nothing
 is read from the client. A request has a body where the site takes one, and says how long it is; it
-is read when whoever answers asks for it. An answer that is ready waits for a turn if the round is
-used up: what many requests wait for may come for all of them at once.
+is read when whoever answers asks for it. A large body that is complete waits for a turn, which
+counts what reading it will cost. An answer that is ready waits for a turn if the round is used up:
+what many requests wait for may come for all of them at once.
+
+A request's body and its answer are memory of a user's: that of strangers, or of whoever has logged
+in with the request, see `Exchange.charge`.
 
 A connection is a guest of its listener for all its life: it makes room when there are too many, see
 `Listeners`.
@@ -26,9 +30,10 @@ from typing import Final, Protocol, cast
 
 import h11
 
+from appliance.broker.accounts import Account
 from appliance.broker.limits import Terms
 from appliance.net.callbacks import contained, contained_made
-from appliance.net.layers import LayerScheduler, MiddleLayer
+from appliance.net.layers import LayerScheduler, MiddleLayer, UpperLayer
 from appliance.net.websocket import HEAD_COST, HEAD_LIMIT, PATH, WebSocket, WebSocketHandler
 
 Headers = tuple[tuple[str, str], ...]
@@ -57,9 +62,19 @@ SMALL_CHUNK = 2048
 ANSWER_COST = 50
 BODY_PER_COST_UNIT = 16 * 1024
 
+#: The bytes of a request's body for a unit of cost: 25 ms a MiB, where much is made of few bytes.
+READ_PER_COST_UNIT = 170
+
 #: Bytes of a body that are handed to the transport at once. The rest waits until they are read: it
 #: is the site's own memory, the same for all who are sent the same.
 BODY_PORTION = 64 * 1024
+
+#: Times that the bytes of a body are in memory at once until it is answered: as they came, decoded,
+#: as they are sent on, and where that is received.
+COPIES = 4
+
+#: Seconds after which to try again what has failed for want of something that others hold now.
+RETRY_AFTER = 5
 
 #: The most lines of a request's head: each takes microseconds, however short it is.
 HEAD_LINES = 128
@@ -69,11 +84,17 @@ EMPTY_LINES = 64
 
 
 class HttpError(Exception):
-    """Why a request is not served: the status of the answer, and its words."""
+    """Why a request is not served: the status of the answer, its words and headers."""
 
-    def __init__(self, status: int, words: str) -> None:
+    def __init__(self, status: int, words: str, *headers: tuple[str, str]) -> None:
         super().__init__(words)
         self.status = status
+        self.headers = headers
+
+    @property
+    def response(self) -> HttpResponse:
+        """The answer that says so."""
+        return text(self.status, str(self), *self.headers)
 
 
 class Exchange(Protocol):
@@ -84,6 +105,9 @@ class Exchange(Protocol):
 
     def allow(self, seconds: float) -> None:
         """Let the answer take so long from now on."""
+
+    def charge(self, client: UpperLayer) -> None:
+        """Count the body and the answer for this client's user, which has logged in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +147,11 @@ class HttpRequest:
         if self.exchange is not None:
             self.exchange.allow(seconds)
 
+    def charge(self, client: UpperLayer) -> None:
+        """Count the body and the answer for this client's user, which has logged in."""
+        if self.exchange is not None:
+            self.exchange.charge(client)
+
     def get(self, name: str) -> str | None:
         """The header of that name in lower case; None if there is none, or more than one."""
         found = [value for key, value in self.headers if key == name]
@@ -137,6 +166,8 @@ class HttpResponse:
     body: bytes = b""
     content_type: str = "text/plain; charset=utf-8"
     headers: Headers = ()
+    #: The body is the site's own memory, the same for all who are sent it.
+    is_shared: bool = False
 
 
 def text(status: int, words: str, *headers: tuple[str, str]) -> HttpResponse:
@@ -177,6 +208,12 @@ class HttpScheduler(LayerScheduler, Protocol):
     def in_background(self, work: Coroutine[object, object, None]) -> None:
         """Run it as a task; it must not raise."""
 
+    def has_room(self, account: Account, size: int) -> bool:
+        """Whether so much more may wait for a client of the account."""
+
+    def count_output(self, account: Account, size: int) -> None:
+        """Add bytes (or subtract, if negative) that wait for a client of the account."""
+
 
 class HttpLayer(MiddleLayer):
     """The layer of HTTP.
@@ -212,6 +249,9 @@ class HttpLayer(MiddleLayer):
         #: Who answers waits for the request's body, of this length.
         self._awaited: asyncio.Future[None] | None = None
         self._length = 0
+        #: Whose the request is, and the bytes that are counted for that user.
+        self._payer: UpperLayer = protocol
+        self._charged = 0
         #: A request is being answered, or its answer is not read yet.
         self._busy = False
         self._writing = True
@@ -244,9 +284,12 @@ class HttpLayer(MiddleLayer):
             else:
                 self._take()
         elif self._awaited is not None and len(self._received) >= self._length:
-            self._pause()
-            self._end_body(None)
-        self._count_own(len(self._received))
+            self._take_body()
+        self._count_received()
+
+    def _count_received(self) -> None:
+        """Count what was received, without the body that its user is charged for."""
+        self._count_own(0 if self._charged else len(self._received))
 
     def _limit(self, seconds: float) -> None:
         """Restart the time limit."""
@@ -299,7 +342,7 @@ class HttpLayer(MiddleLayer):
             self._read_on()
 
     def _take_later(self) -> None:
-        """Take the request in a later turn, when the others had theirs."""
+        """Go on with the request in a later turn, when the others had theirs."""
         self._pause()
         if not self._queued:
             self._queued = True
@@ -311,9 +354,11 @@ class HttpLayer(MiddleLayer):
         response, self._response = self._response, None
         if response is not None:
             self._answer_counted(response)
+        elif self._awaited is not None:
+            self._hand_over_body()
         elif not (self._busy or self._transport.is_closing()):
             self._take()
-            self._count_own(len(self._received))
+            self._count_received()
 
     def _pause(self) -> None:
         if not self._paused:
@@ -401,26 +446,47 @@ class HttpLayer(MiddleLayer):
     async def receive(self, length: int) -> bytes:
         """The body of the request that is answered; see `Exchange`."""
         http = self._http
+        if self._transport.is_closing():
+            raise HttpError(400, "the body is cut off")
+        self._require_room(COPIES * length)
+        self._charge(COPIES * length)
         self._limit(self._timeout)
-        if len(self._received) < length:
-            if self._transport.is_closing():
-                raise HttpError(400, "the body is cut off")
+        self._length = length
+        awaited = self._awaited = asyncio.get_running_loop().create_future()
+        if len(self._received) >= length:
+            self._take_body()
+        else:
             if http.they_are_waiting_for_100_continue:
                 go_on = h11.InformationalResponse(status_code=100, headers=[])
                 self._transport.write(http.send(go_on))
-            self._length = length
-            self._awaited = asyncio.get_running_loop().create_future()
             self._read_on()
-            await self._awaited
+        try:
+            await awaited
+        finally:
+            self._awaited = None
         body = bytes(self._received[:length])
         del self._received[:length]
-        self._count_own(len(self._received))
-        self._scheduler.count_cost(length // BODY_PER_COST_UNIT, self._protocol)
+        self._count_received()
         http.receive_data(body)
         while type(http.next_event()) is h11.Data:
             pass
         self._limit(self._timeout)
         return body
+
+    def _take_body(self) -> None:
+        """The body is complete: let it be read, now or in a turn."""
+        self._pause()
+        self._limit(self._timeout)
+        is_small = self._length <= SMALL_CHUNK
+        if self._queued or self._scheduler.must_wait(self._payer, is_small=is_small):
+            self._take_later()
+        else:
+            self._hand_over_body()
+
+    def _hand_over_body(self) -> None:
+        """Count what reading the body costs, before that is done: it ends the round for others."""
+        self._scheduler.count_cost(self._length // READ_PER_COST_UNIT, self._payer)
+        self._end_body(None)
 
     def _end_body(self, error: HttpError | None) -> None:
         """Nobody waits for the body any more: it is there, or it will not come."""
@@ -437,17 +503,34 @@ class HttpLayer(MiddleLayer):
         if not self._transport.is_closing():
             self._limit(seconds)
 
+    def charge(self, client: UpperLayer) -> None:
+        """Count the body and the answer for this client's user; see `Exchange`."""
+        self._charge(0)
+        self._payer = client
+
+    def _charge(self, size: int) -> None:
+        """So many bytes wait for the client, of a body or of an answer."""
+        if size != self._charged:
+            self._scheduler.count_output(self._payer.account, size - self._charged)
+            self._charged = size
+
+    def _require_room(self, size: int) -> None:
+        """Raise HttpError if so many bytes may not wait for the client."""
+        if not self._scheduler.has_room(self._payer.account, size):
+            limits = "broker.limits.memory, broker.limits.user.memory"
+            words = f"no memory for {size} bytes of a body now ({limits})"
+            raise HttpError(503, words, ("Retry-After", str(RETRY_AFTER)))
+
     async def _respond(self, request: HttpRequest) -> None:
         try:
             try:
                 response = await self._site.respond(request)
             except HttpError as error:
-                response = text(error.status, str(error))
+                response = error.response
             # As a small chunk, not behind all others: `/healthz` answers also without any turns.
             if self._scheduler.must_wait(self._protocol, is_small=True):
                 self._response = response
-                self._queued = True
-                self._scheduler.queue_turn(self)
+                self._take_later()
             else:
                 self._answer_counted(response)
         except Exception as error:
@@ -455,10 +538,19 @@ class HttpLayer(MiddleLayer):
 
     def _answer_counted(self, response: HttpResponse) -> None:
         """Send the answer, and count what that costs, unless the client has gone."""
-        if not self._transport.is_closing():
-            cost = ANSWER_COST + len(response.body) // BODY_PER_COST_UNIT
-            self._scheduler.count_cost(cost, self._protocol)
-            self._answer(response)
+        if self._transport.is_closing():
+            return
+        self._charge(0)  # for the body that was answered
+        own = 0 if response.is_shared else len(response.body)
+        try:
+            self._require_room(own)
+        except HttpError as error:
+            response = error.response
+            own = len(response.body)
+        self._charge(own)
+        cost = ANSWER_COST + len(response.body) // BODY_PER_COST_UNIT
+        self._scheduler.count_cost(cost, self._payer)
+        self._answer(response)
 
     def _answer(self, response: HttpResponse, *more: tuple[str, str]) -> None:
         """Send the answer; go on when it was read."""
@@ -500,6 +592,7 @@ class HttpLayer(MiddleLayer):
         if self._sent < len(self._body):
             return
         self._body, self._sent = b"", 0
+        self._charge(0)  # what the transport has of it is counted there
         self._http.send(h11.EndOfMessage())
         if self._http.our_state is not h11.DONE:
             self._protocol.close()
@@ -511,6 +604,7 @@ class HttpLayer(MiddleLayer):
         if not self._busy or self._transport.is_closing():
             return
         self._busy = False
+        self._payer = self._protocol
         self._http.start_next_cycle()
         if self._received:
             self._limit(self._timeout)
@@ -535,7 +629,7 @@ class HttpLayer(MiddleLayer):
             return
         rest = bytes(self._received)
         self._received.clear()
-        self._count_own(len(self._received))
+        self._count_received()
         if self._deadline is not None:
             self._deadline.cancel()
         protocol, transport = self._protocol, self._transport
@@ -578,6 +672,9 @@ class HttpLayer(MiddleLayer):
             self._deadline.cancel()
         self._end_body(HttpError(400, "the body is cut off"))
         self._received.clear()
+        self._body = b""
+        self._charge(0)
+        self._payer = self._protocol
         self._protocol.connection_lost(exc)
 
     # --- the transport of the protocol above ---------------------------------------------------

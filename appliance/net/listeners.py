@@ -20,6 +20,7 @@ from appliance.broker.limits import USUAL_TERMS, VERSIONS, Terms
 from appliance.host.addresses import network_prefix
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.connection import ClientConnection
+from appliance.net.layers import UpperLayer
 from appliance.net.scheduler import (
     LINGERING_CLOSES,
     Authenticate,
@@ -262,8 +263,9 @@ class Listeners:
 
     def carry(
         self, address: str, host: str, tls: ssl.SSLObject | None, terms: Terms
-    ) -> socket.socket | None:
-        """The client's end of a new connection within this process; None if the limits refuse it.
+    ) -> tuple[socket.socket, UpperLayer] | None:
+        """The client's end of a new connection within this process, and its other end, with the
+        account of who has logged in; None if the limits refuse it.
 
         Who asks from there over another protocol is a client of MQTT by it: with all limits, and
         the identity that its own connection's `tls` gives. The version and the client id are not
@@ -279,7 +281,7 @@ class Listeners:
         self.scheduler.connections.add(protocol)
         self._addresses.add_guest(protocol)
         self.scheduler.in_background(self._begin(protocol, ours, None, None))
-        return theirs
+        return theirs, protocol
 
     def _layer(self, listener: ListenerSettings) -> _Layer:
         if listener.protocol == "websocket":

@@ -269,6 +269,11 @@ class Scheduler:
         account.output += size
         account.bytes += size
 
+    def has_room(self, account: Account, size: int) -> bool:
+        """Whether so much more may wait for a client of the account. A little always may."""
+        accounting = self.broker.accounting
+        return size <= accounting.reserve or accounting.fits(account, size)
+
     def is_output_high(self, account: Account) -> bool:
         """Whether so much output waits that the account's clients may have less.
 

@@ -23,9 +23,10 @@ from appliance.mqtt.codec import Properties, Property, reason_name
 from appliance.mqtt.packets import Publish
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
-from appliance.net.http import HttpError, HttpRequest, HttpResponse
+from appliance.net.http import RETRY_AFTER, HttpError, HttpRequest, HttpResponse
+from appliance.net.layers import UpperLayer
 from appliance.web.carried import CarriedClient, RefusedError, user_properties
-from appliance.web.login import RETRY_AFTER, credentials
+from appliance.web.login import credentials
 from appliance.web.site import Resource
 
 PATH: Final = "/api/v1"
@@ -82,8 +83,10 @@ _CALL_STATUS: Final = {
     "timeout": 504,
 }
 
-#: The client's end of a new connection: `Listeners.carry`.
-Carry: TypeAlias = Callable[[str, str, "ssl.SSLObject | None", Terms], "socket.socket | None"]
+#: Both ends of a new connection: `Listeners.carry`.
+Carry: TypeAlias = Callable[
+    [str, str, "ssl.SSLObject | None", Terms], "tuple[socket.socket, UpperLayer] | None"
+]
 
 #: The work of a JSON text by its values, or any number above the most that it may be: a number is
 #: 1, some 0.1 µs, a text, a list or an object is 8.
@@ -176,12 +179,14 @@ class Api:
             return _error(401, "login", str(error))
         if username is None and password is not None and not self._is_token(password):
             return _error(401, "login", "this is no token")  # and nobody either, if that is enough
-        end = self._carry(request.address, request.peer, request.tls, request.terms)
-        if end is None:
+        ends = self._carry(request.address, request.peer, request.tls, request.terms)
+        if ends is None:
             return _error(503, "busy", "the limits allow no more connections now")
+        own, other = ends
 
         async def carried() -> HttpResponse:
-            async with CarriedClient(end, username, password) as client:
+            async with CarriedClient(own, username, password) as client:
+                request.charge(other)
                 response: HttpResponse = await work(client)
                 return response
 

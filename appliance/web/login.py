@@ -17,12 +17,9 @@ from appliance.broker.limits import Anonymous
 from appliance.broker.values import WRONG_LOGIN, Action, Decision, Identity, Refusal, TlsInfo
 from appliance.mqtt.codec import quote
 from appliance.net import tls
-from appliance.net.http import HttpRequest, HttpResponse, text
+from appliance.net.http import RETRY_AFTER, HttpRequest, HttpResponse, text
 
 log = logging.getLogger(__name__)
-
-#: Seconds after which a client may come again that was not checked.
-RETRY_AFTER = 5
 
 
 class Login(Protocol):

@@ -22,6 +22,7 @@ from appliance.broker.message import Message
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
+from appliance.net import http
 from appliance.web import api
 
 pytestmark = pytest.mark.filterwarnings('ignore:Overriding the "event_loop_policy"')
@@ -325,6 +326,20 @@ async def test_a_client_that_is_ended_while_its_body_comes(web: WebApp):
     await until(lambda: not web.app.broker.clients, "the client to leave")
     await peer.send(body)
     assert (await answer(peer))[0] == 503
+
+
+async def test_the_memory_of_a_body_is_of_who_has_logged_in(web: WebApp):
+    assert (await post(web, "publish", GOOD))[0] == 200  # its password is known from now on
+    account = web.app.broker.accounting.accounts.of_user("admin")
+    peer = await web.dial()
+    body = json.dumps({**GOOD, "payload": "x" * 500_000}).encode()
+    fields = {**basic(), "Content-Type": "application/json", "Content-Length": str(len(body))}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    await peer.send(f"POST /api/v1/publish HTTP/1.1\r\nHost: localhost\r\n{lines}\r\n".encode())
+    await until(lambda: account.output == http.COPIES * len(body), "the body to be counted")
+    await peer.send(body)
+    assert (await answer(peer))[0] == 200
+    await until(lambda: not account.output, "nothing to be counted")
 
 
 async def test_bad_calls(web: WebApp):

@@ -712,10 +712,12 @@ async def web_headers(load: Load) -> None:
     await _finish_at_once(load, wait)
 
 
-async def _finish_at_once(load: Load, wait: Callable[[int], Awaitable[Line]]) -> None:
-    """Send the last byte of 245 requests, of which `wait` has sent the rest, again and again."""
+async def _finish_at_once(
+    load: Load, wait: Callable[[int], Awaitable[Line]], count: int = 245
+) -> None:
+    """Send the last byte of so many requests, of which `wait` has sent the rest, over and over."""
     while load.on:
-        lines = await load.crowd(245, wait, 1.0)
+        lines = await load.crowd(count, wait, 1.0)
         await asyncio.sleep(0.1)  # for the broker to have read them
         for line in lines:
             line.send_nowait(b"\n")
@@ -768,6 +770,28 @@ async def http_bodies(load: Load) -> None:
     body = b'{"topic": "%s", "payload": [%s[]]}' % (AREA.encode(), b"[]," * 340_000)
     await load.together(*(_post_forever(load, _post(load, len(body)) + body) for _ in range(4)))
     assert load.counts["answers"]
+
+
+@attack(CLIENT, at_least=3.0, over=Over.PLAIN, connect_timeout="10 s")
+async def http_bodies_at_once(load: Load) -> None:
+    """The last byte of 20 bodies of up to 1 MiB for the API that are read slowly, in one moment."""
+    begin = b'{"topic": "%s", "payload": ' % AREA.encode()
+    names = b",".join(b'"%05d":1.5' % number for number in range(49_000))
+    bodies = itertools.cycle(
+        [
+            begin + b"{" + names + b"}}\n",
+            begin + b'"' + rb"\"" * 520_000 + b'"}\n',
+            begin + b"[" + b",".join([b"1.234567"] * 99_000) + b"]}\n",
+        ]
+    )
+
+    async def wait(_: int) -> Line:
+        body = next(bodies)
+        line = await load.http()
+        await line.send(_post(load, len(body)) + body[:-1])
+        return line
+
+    await _finish_at_once(load, wait, 20)
 
 
 @attack(CLIENT, at_least=4.0, over=Over.PLAIN, connect_timeout="3 s")

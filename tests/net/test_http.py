@@ -17,6 +17,7 @@ from http_client import answer, ask
 from waiting import PATIENCE, until
 from websockets.asyncio.client import connect
 
+from appliance.broker.accounts import Account
 from appliance.mqtt.packets import Connack, Connect, decode_packet
 from appliance.net import http
 from appliance.net.http import HEAD_LIMIT, SECURITY_HEADERS, HttpRequest, HttpResponse, text
@@ -35,20 +36,33 @@ MOST_COST = 2 * COST_PER_ROUND + COST_BETWEEN_CHECKS + COST_BEYOND_ROUND
 MOST_ANSWERS = MOST_COST // http.ANSWER_COST + 3
 
 
+class Payer:
+    """A client that has logged in with a request, as its connection charges it."""
+
+    def __init__(self, name: str) -> None:
+        self.account = Account(name)
+
+
 class WebHarness(Harness):
     """Two listeners for the web: plain, and with TLS."""
+
+    #: Whose requests with a body are.
+    payer: Any = Payer("alice")
 
     def make(
         self, connections: int = 100, connect_timeout: float = PATIENCE, **limits: float
     ) -> Listeners:
         self.requests: MutableSequence[HttpRequest] = []
         self.slow = asyncio.Event()
+        self.payer = Payer("alice")
+        self.bodies: list[int] = []
         site = WebSite(
             {
                 "/small": Resource(self._small),
                 "/slow": Resource(self._slow),
                 "/large": Resource(self._large),
                 "/broken": Resource(self._broken),
+                "/echo": Resource(self._echo, ("POST",), takes_body=True),
             },
             lambda: {"localhost", "*.robots.example"},
             lambda tls: None,
@@ -84,7 +98,16 @@ class WebHarness(Harness):
 
     async def _large(self, request: HttpRequest) -> HttpResponse:
         self.requests.append(request)
-        return HttpResponse(200, LARGE, "application/octet-stream")
+        return HttpResponse(200, LARGE, "application/octet-stream", is_shared=True)
+
+    async def _echo(self, request: HttpRequest) -> HttpResponse:
+        """The body and as much again as is asked for, when the test lets it go."""
+        request.charge(self.payer)
+        body = await request.body(8 << 20)
+        self.bodies.append(len(body))
+        if request.query:
+            await self.slow.wait()
+        return HttpResponse(200, body + bytes(int(request.query or "0")))
 
     async def _broken(self, request: HttpRequest) -> HttpResponse:
         raise ZeroDivisionError("the test says so")
@@ -340,6 +363,102 @@ async def test_answers_that_many_wait_for_are_sent_in_several_rounds(harness: We
     assert max(sent) <= MOST_ANSWERS, sent
     assert counters.cost - before >= len(peers) * http.ANSWER_COST
     assert {(await answer(peer))[2] for peer in peers} == {b"slow\n"}
+
+
+def post(length: int, more: str = "") -> bytes:
+    head = f"POST /echo{more} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n\r\n"
+    return head.encode() + bytes(length)
+
+
+async def test_bodies_that_are_complete_at_once_are_read_in_several_rounds(harness: WebHarness):
+    """Reading one is as much as a round may be, and is counted before it is done."""
+    await harness.start(connections=300)
+    length = 2 * COST_PER_ROUND * http.READ_PER_COST_UNIT
+    request = post(length)
+    peers = [await harness.dial() for _ in range(10)]
+    for peer in peers:
+        await peer.send(request[:-1])
+    received = harness.scheduler.connections
+    await until(
+        lambda: (
+            sum(each._below_size for each in received) == 0  # type: ignore[attr-defined]
+            and harness.payer.account.output == len(peers) * length * http.COPIES
+        ),
+        "their users to be charged",
+    )
+    await asyncio.sleep(0.1)  # all but one byte of each is there
+    before = harness.broker.counters.cost
+    for peer in peers:
+        peer.writer.write(request[-1:])
+    read: list[int] = []
+    while len(harness.bodies) < len(peers):
+        already = len(harness.bodies)
+        await asyncio.sleep(0)
+        read.append(len(harness.bodies) - already)
+    assert max(read) <= 2, read  # the first may be read at once, and one in the turns
+    assert harness.broker.counters.cost - before >= 2 * COST_PER_ROUND * len(peers)
+    for peer in peers:
+        assert (await answer(peer))[0] == 200
+
+
+@pytest.mark.parametrize("sent", ["at once", "behind its head"])
+@pytest.mark.parametrize("tls", [False, True])
+async def test_a_body_and_its_answer_are_memory_of_their_user(
+    harness: WebHarness, tls: bool, sent: str
+) -> None:
+    await harness.start(connect_timeout=PATIENCE)
+    account, strangers = harness.payer.account, harness.broker.accounting.accounts.strangers
+    request = post(100_000, "?6000000")
+    peer = await harness.dial(tls, receive_buffer=4096)
+    peer.writer.transport.pause_reading()
+    if sent == "behind its head":
+        await peer.send(request[:-100_000])
+        await until(
+            lambda: account.output == 100_000 * http.COPIES,
+            "the body that is to come to be counted",
+        )
+        request = request[-100_000:]
+    await peer.send(request)
+    await until(lambda: harness.bodies, "the body")
+    assert account.output == 100_000 * http.COPIES
+    assert strangers.bytes == 0
+    harness.slow.set()
+    await until(lambda: account.output == 6_100_000, "the answer to be counted")
+    assert strangers.output <= 2 * http.BODY_PORTION  # what the transport has
+    peer.writer.transport.resume_reading()
+    assert len((await answer(peer))[2]) == 6_100_000
+    assert (account.output, account.bytes, strangers.bytes) == (0, 0, 0)
+    harness.slow.clear()
+    await peer.send(post(5, "?1"))
+    await until(lambda: account.output == 5 * http.COPIES, "another body")
+    peer.writer.transport.abort()  # type: ignore[attr-defined]
+    harness.slow.set()
+    await until(lambda: not harness.scheduler.connections, "its end to be noticed")
+    assert (account.output, strangers.output, harness.scheduler.output) == (0, 0, 0)
+
+
+async def test_no_memory_for_a_body_or_an_answer(harness: WebHarness):
+    await harness.start()
+    accounting, account = harness.broker.accounting, harness.payer.account
+    others = accounting.quotas.memory.own - 12_000_000
+    harness.scheduler.count_output(account, others)
+    peer = await harness.dial()
+    await peer.send(post(4_000_000))
+    status, headers, body = await answer(peer)
+    assert (status, headers["connection"], headers["retry-after"]) == (503, "close", "5")
+    assert body.startswith(b"no memory for 16000000 bytes of a body now (broker.limits.memory, ")
+    peer = await harness.dial()
+    harness.slow.set()
+    await peer.send(post(2_000_000, "?11000000"))
+    status, _, body = await answer(peer)
+    assert status == 503 and body.startswith(b"no memory for 13000000 bytes ")
+    await peer.send(post(2_000_000))
+    assert (await answer(peer))[0] == 200
+    harness.scheduler.count_output(account, 12_000_000)
+    await peer.send(post(100))
+    assert (await answer(peer))[0] == 200  # a little is always possible
+    assert account.output == accounting.quotas.memory.own
+    harness.scheduler.count_output(account, -account.output)
 
 
 async def test_a_fault_ends_one_connection(harness: WebHarness, escaped: list[str]):

@@ -68,7 +68,9 @@ def json_cost(payload: bytes, most: int) -> int:
     if cost > most:
         return cost
     # Some of what was counted may be names, or characters within texts. Now remove the texts.
-    parts = payload.replace(rb"\\", b"").replace(rb"\"", b"").split(b'"', 2 * most)
+    parts = payload.replace(rb"\\", b"").replace(rb"\"", b"").split(b'"', most + 2)
+    if len(parts) > most + 2:
+        return most + 1  # a text is a name, which a value follows, or costs more than these two
     outside = b"".join(parts[::2])
     names = outside.count(b":")
     return names + _count_marks(outside, max(len(parts) // 2 - names, 0))
