@@ -69,9 +69,12 @@ READ_PER_COST_UNIT = 170
 #: is the site's own memory, the same for all who are sent the same.
 BODY_PORTION = 64 * 1024
 
-#: Times that the bytes of a body are in memory at once until it is answered: as they came, decoded,
-#: as they are sent on, and where that is received.
+#: Times that the bytes of a body are in memory at once: as they came, decoded, as they are sent on,
+#: and where that is received, which counts them, too, when they have come so far.
 COPIES = 4
+
+#: The limits that a user's memory has.
+MEMORY_LIMITS = "broker.limits.memory, broker.limits.user.memory"
 
 #: Seconds after which to try again what has failed for want of something that others hold now.
 RETRY_AFTER = 5
@@ -211,8 +214,8 @@ class HttpScheduler(LayerScheduler, Protocol):
     def has_room(self, account: Account, size: int) -> bool:
         """Whether so much more may wait for a client of the account."""
 
-    def count_output(self, account: Account, size: int) -> None:
-        """Add bytes (or subtract, if negative) that wait for a client of the account."""
+    def take(self, account: Account, size: int) -> None:
+        """Count so many more bytes (fewer, if negative) that wait for a client of the account."""
 
 
 class HttpLayer(MiddleLayer):
@@ -289,7 +292,7 @@ class HttpLayer(MiddleLayer):
 
     def _count_received(self) -> None:
         """Count what was received, without the body that its user is charged for."""
-        self._count_own(0 if self._charged else len(self._received))
+        self._count_own(max(len(self._received) - self._length, 0))
 
     def _limit(self, seconds: float) -> None:
         """Restart the time limit."""
@@ -303,7 +306,9 @@ class HttpLayer(MiddleLayer):
     def _too_late(self) -> None:
         if self._transport.is_closing():
             return
-        if self._awaited is not None:
+        if self._awaited is not None and len(self._received) >= self._length:
+            self._limit(self._allowed)  # it waits for its turn
+        elif self._awaited is not None:
             self._end_body(HttpError(408, f"no complete request within {self._timeout:g} s"))
         elif self._busy or not self._writing:
             what = "ready" if self._http.our_state is h11.SEND_RESPONSE else "read"
@@ -352,11 +357,13 @@ class HttpLayer(MiddleLayer):
         """Continue: the others have had their turn."""
         self._queued = False
         response, self._response = self._response, None
+        if self._transport.is_closing():
+            return
         if response is not None:
             self._answer_counted(response)
         elif self._awaited is not None:
             self._hand_over_body()
-        elif not (self._busy or self._transport.is_closing()):
+        elif not self._busy:
             self._take()
             self._count_received()
 
@@ -448,10 +455,13 @@ class HttpLayer(MiddleLayer):
         http = self._http
         if self._transport.is_closing():
             raise HttpError(400, "the body is cut off")
-        self._require_room(COPIES * length)
+        if not self._has_room(COPIES * length):
+            words = f"no memory for a body of {length} bytes now ({MEMORY_LIMITS})"
+            raise HttpError(503, words, ("Retry-After", str(RETRY_AFTER)))
         self._charge(COPIES * length)
-        self._limit(self._timeout)
         self._length = length
+        self._count_received()
+        self._limit(self._timeout)
         awaited = self._awaited = asyncio.get_running_loop().create_future()
         if len(self._received) >= length:
             self._take_body()
@@ -464,8 +474,12 @@ class HttpLayer(MiddleLayer):
             await awaited
         finally:
             self._awaited = None
+            self._length = 0
+        if len(self._received) < length:
+            raise HttpError(400, "the body is cut off")
         body = bytes(self._received[:length])
         del self._received[:length]
+        self._charge((COPIES - 1) * length)
         self._count_received()
         http.receive_data(body)
         while type(http.next_event()) is h11.Data:
@@ -511,15 +525,12 @@ class HttpLayer(MiddleLayer):
     def _charge(self, size: int) -> None:
         """So many bytes wait for the client, of a body or of an answer."""
         if size != self._charged:
-            self._scheduler.count_output(self._payer.account, size - self._charged)
+            self._scheduler.take(self._payer.account, size - self._charged)
             self._charged = size
 
-    def _require_room(self, size: int) -> None:
-        """Raise HttpError if so many bytes may not wait for the client."""
-        if not self._scheduler.has_room(self._payer.account, size):
-            limits = "broker.limits.memory, broker.limits.user.memory"
-            words = f"no memory for {size} bytes of a body now ({limits})"
-            raise HttpError(503, words, ("Retry-After", str(RETRY_AFTER)))
+    def _has_room(self, size: int) -> bool:
+        """Whether so many bytes may wait for the client, whoever it is."""
+        return self._scheduler.has_room(self._payer.account, size)
 
     async def _respond(self, request: HttpRequest) -> None:
         try:
@@ -528,7 +539,7 @@ class HttpLayer(MiddleLayer):
             except HttpError as error:
                 response = error.response
             # As a small chunk, not behind all others: `/healthz` answers also without any turns.
-            if self._scheduler.must_wait(self._protocol, is_small=True):
+            if self._scheduler.must_wait(self._payer, is_small=True):
                 self._response = response
                 self._take_later()
             else:
@@ -541,13 +552,12 @@ class HttpLayer(MiddleLayer):
         if self._transport.is_closing():
             return
         self._charge(0)  # for the body that was answered
-        own = 0 if response.is_shared else len(response.body)
-        try:
-            self._require_room(own)
-        except HttpError as error:
-            response = error.response
-            own = len(response.body)
-        self._charge(own)
+        # Strangers are sent little, such as metrics, which are wanted most when memory is short.
+        is_free = response.is_shared or self._payer is self._protocol
+        if not (is_free or self._has_room(len(response.body))):
+            words = f"what was asked for is done, but its answer of {len(response.body)} bytes is"
+            response = text(507, f"{words} lost for want of memory ({MEMORY_LIMITS})")
+        self._charge(0 if response.is_shared else len(response.body))
         cost = ANSWER_COST + len(response.body) // BODY_PER_COST_UNIT
         self._scheduler.count_cost(cost, self._payer)
         self._answer(response)

@@ -274,6 +274,10 @@ class Scheduler:
         accounting = self.broker.accounting
         return size <= accounting.reserve or accounting.fits(account, size)
 
+    def take(self, account: Account, size: int) -> None:
+        """Count so many more bytes (fewer, if negative) that wait for a client of the account."""
+        self.broker.accounting.take(account, size)
+
     def is_output_high(self, account: Account) -> bool:
         """Whether so much output waits that the account's clients may have less.
 

@@ -336,10 +336,10 @@ async def test_the_memory_of_a_body_is_of_who_has_logged_in(web: WebApp):
     fields = {**basic(), "Content-Type": "application/json", "Content-Length": str(len(body))}
     lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
     await peer.send(f"POST /api/v1/publish HTTP/1.1\r\nHost: localhost\r\n{lines}\r\n".encode())
-    await until(lambda: account.output == http.COPIES * len(body), "the body to be counted")
+    await until(lambda: account.bytes == http.COPIES * len(body), "the body to be counted")
     await peer.send(body)
     assert (await answer(peer))[0] == 200
-    await until(lambda: not account.output, "nothing to be counted")
+    await until(lambda: not account.bytes, "nothing to be counted")
 
 
 async def test_bad_calls(web: WebApp):

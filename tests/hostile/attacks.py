@@ -725,6 +725,7 @@ async def _finish_at_once(
         await asyncio.sleep(0.2)
         for line in lines:
             load.counts["answered"] += line.received > 0
+            load.counts["served"] += line.first.startswith(b"HTTP/1.1 200")
             line.abort()
             load.lines.discard(line)
     assert load.counts["answered"]
@@ -792,6 +793,7 @@ async def http_bodies_at_once(load: Load) -> None:
         return line
 
     await _finish_at_once(load, wait, 20)
+    assert load.counts["served"]  # not refused before they were read
 
 
 @attack(CLIENT, at_least=4.0, over=Over.PLAIN, connect_timeout="3 s")

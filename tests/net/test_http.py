@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from both_loops import event_loop_policy as event_loop_policy
-from harness import Harness
+from harness import Harness, Peer
 from http_client import answer, ask
 from waiting import PATIENCE, until
 from websockets.asyncio.client import connect
@@ -93,6 +93,8 @@ class WebHarness(Harness):
 
     async def _slow(self, request: HttpRequest) -> HttpResponse:
         self.requests.append(request)
+        if request.query:
+            request.charge(self.payer)
         await self.slow.wait()
         return text(200, "slow")
 
@@ -338,12 +340,15 @@ async def test_who_is_slow_to_read_gets_all_of_it(harness: WebHarness, tls: bool
     assert (await answer(peer))[0] == 200
 
 
-async def test_answers_that_many_wait_for_are_sent_in_several_rounds(harness: WebHarness):
+@pytest.mark.parametrize("whose", ["strangers", "a user's"])
+async def test_answers_that_many_wait_for_are_sent_in_several_rounds(
+    harness: WebHarness, whose: str
+) -> None:
     """And not all in the iteration of the loop in which what they wait for comes."""
     await harness.start(connections=300)
     peers = [await harness.dial() for _ in range(100)]
     for peer in peers:
-        await peer.send(GET.replace(b"small", b"slow"))
+        await peer.send(GET.replace(b"small", b"slow" if whose == "strangers" else b"slow?1"))
     await until(lambda: len(harness.requests) == len(peers), "the requests")
     sent: list[int] = []
     own = http.HttpLayer._answer
@@ -370,26 +375,32 @@ def post(length: int, more: str = "") -> bytes:
     return head.encode() + bytes(length)
 
 
-async def test_bodies_that_are_complete_at_once_are_read_in_several_rounds(harness: WebHarness):
-    """Reading one is as much as a round may be, and is counted before it is done."""
-    await harness.start(connections=300)
+async def send_at_once(harness: WebHarness, count: int) -> list[Peer]:
+    """Clients whose bodies, each as much as a round may cost, are complete in one moment."""
     length = 2 * COST_PER_ROUND * http.READ_PER_COST_UNIT
     request = post(length)
-    peers = [await harness.dial() for _ in range(10)]
+    peers = [await harness.dial() for _ in range(count)]
     for peer in peers:
         await peer.send(request[:-1])
-    received = harness.scheduler.connections
+    connections = harness.scheduler.connections
     await until(
         lambda: (
-            sum(each._below_size for each in received) == 0  # type: ignore[attr-defined]
-            and harness.payer.account.output == len(peers) * length * http.COPIES
+            sum(each._below_size for each in connections) == 0  # type: ignore[attr-defined]
+            and harness.payer.account.bytes == count * length * http.COPIES
         ),
         "their users to be charged",
     )
     await asyncio.sleep(0.1)  # all but one byte of each is there
-    before = harness.broker.counters.cost
     for peer in peers:
         peer.writer.write(request[-1:])
+    return peers
+
+
+async def test_bodies_that_are_complete_at_once_are_read_in_several_rounds(harness: WebHarness):
+    """Reading one is as much as a round may be, and is counted before it is done."""
+    await harness.start(connections=300)
+    before = harness.broker.counters.cost
+    peers = await send_at_once(harness, 10)
     read: list[int] = []
     while len(harness.bodies) < len(peers):
         already = len(harness.bodies)
@@ -399,6 +410,49 @@ async def test_bodies_that_are_complete_at_once_are_read_in_several_rounds(harne
     assert harness.broker.counters.cost - before >= 2 * COST_PER_ROUND * len(peers)
     for peer in peers:
         assert (await answer(peer))[0] == 200
+
+
+async def test_connections_that_end_while_their_bodies_wait_for_a_turn(harness: WebHarness):
+    """As when they make room for others; that is no fault, and nothing stays counted."""
+    await harness.start(connections=300)
+    await send_at_once(harness, 10)
+    while not harness.bodies:  # noqa: ASYNC110 - the very next iteration of the loop counts
+        await asyncio.sleep(0)
+    for connection in list(harness.scheduler.connections):
+        connection.make_room()
+    await until(lambda: not harness.scheduler.connections, "them to be gone")
+    await asyncio.sleep(0.05)
+    assert len(harness.bodies) < 10
+    assert harness.broker.faults.by_entry == {}
+    assert harness.payer.account.bytes == harness.broker.accounting.queued_bytes == 0
+
+
+async def test_a_complete_body_that_waits_for_its_turn_is_not_late(
+    harness: WebHarness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting: list[http.HttpLayer] = []
+    monkeypatch.setattr(http.HttpLayer, "_take_body", lambda layer: waiting.append(layer))
+    await harness.start(connect_timeout=0.1)
+    peer = await harness.dial()
+    await peer.send(post(10))
+    await until(lambda: waiting, "the body")
+    await asyncio.sleep(0.5)
+    waiting[0]._hand_over_body()
+    assert (await answer(peer))[0] == 200
+
+
+async def test_what_comes_behind_a_body_is_counted(harness: WebHarness):
+    await harness.start()
+    strangers = harness.broker.accounting.accounts.strangers
+    peer = await harness.dial()
+    await peer.send(post(60, "?0") + GET * 1000)
+    await until(lambda: harness.bodies, "the body")
+    assert harness.payer.account.bytes == 60 * (http.COPIES - 1)
+    assert strangers.bytes > len(GET) * 1000 // 4
+    harness.slow.set()
+    for _ in range(1001):
+        assert (await answer(peer))[0] == 200
+    assert (harness.payer.account.bytes, strangers.bytes) == (0, 0)
 
 
 @pytest.mark.parametrize("sent", ["at once", "behind its head"])
@@ -414,51 +468,52 @@ async def test_a_body_and_its_answer_are_memory_of_their_user(
     if sent == "behind its head":
         await peer.send(request[:-100_000])
         await until(
-            lambda: account.output == 100_000 * http.COPIES,
+            lambda: account.bytes == 100_000 * http.COPIES,
             "the body that is to come to be counted",
         )
         request = request[-100_000:]
     await peer.send(request)
     await until(lambda: harness.bodies, "the body")
-    assert account.output == 100_000 * http.COPIES
+    assert account.bytes == 100_000 * (http.COPIES - 1)
     assert strangers.bytes == 0
     harness.slow.set()
-    await until(lambda: account.output == 6_100_000, "the answer to be counted")
+    await until(lambda: account.bytes == 6_100_000, "the answer to be counted")
     assert strangers.output <= 2 * http.BODY_PORTION  # what the transport has
     peer.writer.transport.resume_reading()
     assert len((await answer(peer))[2]) == 6_100_000
-    assert (account.output, account.bytes, strangers.bytes) == (0, 0, 0)
+    assert (account.bytes, strangers.bytes) == (0, 0)
     harness.slow.clear()
     await peer.send(post(5, "?1"))
-    await until(lambda: account.output == 5 * http.COPIES, "another body")
+    await until(lambda: account.bytes == 5 * (http.COPIES - 1), "another body")
     peer.writer.transport.abort()  # type: ignore[attr-defined]
     harness.slow.set()
     await until(lambda: not harness.scheduler.connections, "its end to be noticed")
-    assert (account.output, strangers.output, harness.scheduler.output) == (0, 0, 0)
+    assert (account.bytes, strangers.bytes, harness.broker.accounting.queued_bytes) == (0, 0, 0)
 
 
 async def test_no_memory_for_a_body_or_an_answer(harness: WebHarness):
     await harness.start()
     accounting, account = harness.broker.accounting, harness.payer.account
     others = accounting.quotas.memory.own - 12_000_000
-    harness.scheduler.count_output(account, others)
+    accounting.take(account, others)
     peer = await harness.dial()
     await peer.send(post(4_000_000))
     status, headers, body = await answer(peer)
     assert (status, headers["connection"], headers["retry-after"]) == (503, "close", "5")
-    assert body.startswith(b"no memory for 16000000 bytes of a body now (broker.limits.memory, ")
+    assert body.startswith(b"no memory for a body of 4000000 bytes now (broker.limits.memory, ")
     peer = await harness.dial()
     harness.slow.set()
     await peer.send(post(2_000_000, "?11000000"))
     status, _, body = await answer(peer)
-    assert status == 503 and body.startswith(b"no memory for 13000000 bytes ")
+    assert (status, body[:32]) == (507, b"what was asked for is done, but ")
+    assert b"13000000 bytes is lost for want of memory (broker.limits.memory, " in body
     await peer.send(post(2_000_000))
     assert (await answer(peer))[0] == 200
-    harness.scheduler.count_output(account, 12_000_000)
+    accounting.take(account, 12_000_000)
     await peer.send(post(100))
     assert (await answer(peer))[0] == 200  # a little is always possible
-    assert account.output == accounting.quotas.memory.own
-    harness.scheduler.count_output(account, -account.output)
+    assert account.bytes == accounting.quotas.memory.own
+    accounting.take(account, -account.bytes)
 
 
 async def test_a_fault_ends_one_connection(harness: WebHarness, escaped: list[str]):
