@@ -226,14 +226,15 @@ class FileAccess:
         """Whether the users file has a line for this user."""
         return username is not None and self._passwords.hash_of(username) is not None
 
-    def exchange(self, method: str, address: str | None) -> Exchange | None:
+    def exchange(self, method: str, address: str, again: str | None = None) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered.
 
         SCRAM-SHA-256 is offered where there is a users file. Each step uses the users that are in
         force then, so a reload between two steps is noticed.
 
-        With an address it counts as a guess. `address` is None for a client that has logged in and
-        authenticates again, which others' guesses must not throw out.
+        It counts as a guess from the address. `again` is the user of a client that has logged in
+        and authenticates again: others' guesses must not throw it out, and it can guess nobody's
+        password but its own.
         """
         if method != METHOD or self._in_force.users_path is None:
             return None
@@ -241,8 +242,8 @@ class FileAccess:
         def verifier_of(username: str) -> Verifier:
             return self._passwords.verifier(username)
 
-        if address is None:
-            return ScramExchange(verifier_of)
+        if again is not None:
+            return ScramExchange(verifier_of, only=again)
         throttle = self.throttle
         return ScramExchange(
             verifier_of,

@@ -148,11 +148,11 @@ class LoginPolicy:
         return who, noted
 
     def exchange(
-        self, method: str, address: str | None, tls: ssl.SSLObject | None
+        self, method: str, address: str, tls: ssl.SSLObject | None, again: str | None = None
     ) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered to this client.
 
-        `address` is None for a client that has logged in and authenticates again.
+        `again` is the user of a client that has logged in and authenticates again.
         """
         if self._plugins is not None and self._plugins.authenticates:
             return None
@@ -162,7 +162,7 @@ class LoginPolicy:
                     return None
             except ValueError:
                 return None
-        return self._files.exchange(method, address)
+        return self._files.exchange(method, address, again)
 
 
 def _by_certificate(owner: str, connect: Connect) -> Identity | Refusal:

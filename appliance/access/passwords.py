@@ -47,8 +47,6 @@ _MAX_PASSES: Final = 64
 _MAX_LANES: Final = 16
 _MAX_ITERATIONS: Final = 10_000_000
 
-_MAX_USERNAME: Final = 256  # bytes
-
 _ARGON2ID: Final = re.compile(
     r"\$argon2id\$v=19\$m=(\d{1,9}),t=(\d{1,9}),p=(\d{1,9})"
     r"\$[A-Za-z0-9+/]{11,}\$[A-Za-z0-9+/]{16,}"
@@ -67,8 +65,7 @@ def check_username(username: str) -> None:
     """Raise a ValueError that says why `username` cannot be in the users file."""
     if not username:
         raise ValueError("a user name must not be empty")
-    if len(username.encode("utf-8", "surrogatepass")) > _MAX_USERNAME:
-        raise ValueError(f"a user name must not be longer than {_MAX_USERNAME} bytes")
+    scram.check_length(username)
     if ":" in username:
         raise ValueError("a user name must not hold ':', which ends it in the users file")
     if username[0] == "#":

@@ -39,8 +39,10 @@ _MAX_SALT_SIZE: Final = 128
 # A user name of 256 bytes, every one escaped, twice, and nonces of 256 characters.
 _MAX_MESSAGE: Final = 2048
 
-# Characters that are prepared at most: SASLprep examines each one, and strangers' names are
-# prepared on the event loop. ASCII text may be longer.
+# The most bytes of a user name, in UTF-8. Strangers' names are prepared on the event loop.
+_MAX_USERNAME: Final = 256
+
+# Characters that are prepared at most: SASLprep examines each one. ASCII text may be longer.
 _MAX_PREPARED: Final = 256
 
 _STORED: Final = re.compile(
@@ -195,12 +197,15 @@ class ScramExchange:
         *,
         admits: Callable[[], bool] = lambda: True,
         failed: Callable[[str], None] = lambda username: None,
+        only: str | None = None,
     ) -> None:
         """`verifier_of` is called at both messages; a verifier that changes between them fails.
 
         `nonce` is the server's part of it, a random one unless a test brings its own. `admits` is
         asked before anything is revealed about a user, `failed` is called for a wrong proof of one.
+        `only` is the one user that the client may be, if it has logged in and does so again.
         """
+        self._only = only
         self._verifier_of = verifier_of
         self._admits = admits
         self._failed = failed
@@ -232,15 +237,18 @@ class ScramExchange:
             raise ValueError("not a client-first-message")
         if match["bound"]:
             raise ValueError("the client asks for channel binding, which is not offered")
-        name = prepared_name(_unescaped(match["name"]))
-        if match["authzid"] and prepared_name(_unescaped(match["authzid"])) != name:
-            raise ValueError(f"user {name!r} may not act for another one")
         if not self._admits():
             return Refusal(
                 ReasonCode.SERVER_BUSY,
                 "too many logins from its address were wrong, it has to come again "
                 "(broker.limits.failed_logins)",
             )
+        name = prepared_name(_unescaped(match["name"]))
+        other = match["authzid"]
+        if other not in (None, match["name"]) and prepared_name(_unescaped(other)) != name:
+            raise ValueError(f"user {name!r} may not act for another one")
+        if self._only not in (None, name):
+            raise ValueError("a client authenticates again as the user that it is")
         verifier = self._verifier_of(name)
         nonce = match["nonce"] + self._nonce
         answer = f"r={nonce},s={_base64(verifier.salt)},i={verifier.iterations}"
@@ -286,7 +294,7 @@ def saslprep(text: str) -> str:
     ValueError says what is wrong with it, worded to follow a subject ("a password ...").
     """
     if not text.isascii():
-        _check_length(text)
+        _check_prepared(text)
         mapped = (
             " " if stringprep.in_table_c12(c) else c for c in text if not stringprep.in_table_b1(c)
         )
@@ -297,7 +305,7 @@ def saslprep(text: str) -> str:
         if not text.isprintable():
             raise ValueError(_PROHIBITED)
         return text
-    _check_length(text)  # One character can have become eighteen.
+    _check_prepared(text)  # One character can have become eighteen.
     if any(is_in(c) for c in text for is_in in _PROHIBITED_TABLES):
         raise ValueError(_PROHIBITED)
     # RFC 3454, section 6: right to left is not mixed with left to right, and is at both ends.
@@ -309,7 +317,7 @@ def saslprep(text: str) -> str:
     return text
 
 
-def _check_length(text: str) -> None:
+def _check_prepared(text: str) -> None:
     if len(text) > _MAX_PREPARED:
         raise ValueError(f"must not be longer than {_MAX_PREPARED} characters")
 
@@ -333,10 +341,17 @@ _PROHIBITED_TABLES: Final = (
 
 def prepared_name(username: str) -> str:
     """The user name as clients send it; ValueError says why it cannot be one."""
+    check_length(username)
     try:
         return saslprep(username)
     except ValueError as error:
         raise ValueError(f"a user name {error}") from None
+
+
+def check_length(username: str) -> None:
+    """Raise a ValueError that says that the user name is too long."""
+    if len(username.encode("utf-8", "surrogatepass")) > _MAX_USERNAME:
+        raise ValueError(f"a user name must not be longer than {_MAX_USERNAME} bytes")
 
 
 def _unescaped(name: str) -> str:

@@ -966,6 +966,8 @@ class ClientHandler:
     def _authenticate(self, exchange: Exchange, properties: Properties) -> None:
         data = properties.get(Property.AUTHENTICATION_DATA, b"")
         assert isinstance(data, bytes)
+        if not data.isascii():  # names in it are examined character by character
+            self._counters.cost += len(data) // 3
         outcome = exchange.step(data)
         if isinstance(outcome, bytes):
             answer = self._authentication(outcome)

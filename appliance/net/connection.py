@@ -772,8 +772,9 @@ class ClientConnection:
 
     def exchange(self, method: str) -> Exchange | None:
         """Begin an enhanced authentication; None when the method is not offered."""
-        is_guest = self._client.session is None
-        return self._scheduler.exchange(method, self.address if is_guest else None, self._tls)
+        session = self._client.session
+        again = session.identity.username if session is not None and session.identity else None
+        return self._scheduler.exchange(method, self.address, self._tls, again)
 
     def now(self) -> float:
         """Seconds of the event loop's clock."""

@@ -62,9 +62,11 @@ Authenticate: TypeAlias = Callable[
     [Connect, str, "ssl.SSLObject | None", Anonymous], Awaitable["Identity | Refusal"]
 ]
 
-#: Begins an enhanced authentication by this method; None when it is not offered. There is no
-#: address of a client that has logged in and authenticates again.
-BeginExchange: TypeAlias = Callable[[str, "str | None", "ssl.SSLObject | None"], "Exchange | None"]
+#: Begins an enhanced authentication by this method from an address; None when it is not offered.
+#: The last is the user of a client that has logged in and authenticates again.
+BeginExchange: TypeAlias = Callable[
+    [str, str, "ssl.SSLObject | None", "str | None"], "Exchange | None"
+]
 
 
 class CertificatePolicy(Protocol):

@@ -957,3 +957,25 @@ def test_what_comes_behind_an_acknowledgement_finds_its_room(access: FakeAccess,
     assert isinstance(answer, Puback) and (answer.packet_id, answer.reason_code) == (9, 0)
     assert not drops(broker) and not reader.transport.closed
     check_accounts(broker)
+
+
+def test_names_that_are_not_ascii_cost_more(broker: Broker) -> None:
+    """They are examined character by character, before anybody knows who it is."""
+
+    class Asking:
+        """An exchange that goes on."""
+
+        def step(self, data: bytes) -> bytes:
+            return b"more"
+
+    def cost(data: bytes) -> int:
+        peer = Peer(broker)
+        peer.transport.exchanges["SCRAM"] = Asking()
+        before = broker.counters.cost
+        peer.say_connect(properties={P.AUTHENTICATION_METHOD: "SCRAM", P.AUTHENTICATION_DATA: data})
+        assert isinstance(peer.received()[0], Auth)
+        return broker.counters.cost - before
+
+    name = "\u0e01" * 85
+    plain = cost(b"n,,n=" + b"x" * len(name.encode()))
+    assert cost(f"n,,n={name}".encode()) - plain >= len(name)

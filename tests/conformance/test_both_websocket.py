@@ -124,7 +124,7 @@ async def dial(broker: Broker) -> AsyncIterator[Dial]:
         return Identity(connect.username, connect.client_id)
 
     listeners = Listeners(
-        broker, let_in, lambda method, address, tls: None, Admission(10, PATIENCE)
+        broker, let_in, lambda method, address, tls, again: None, Admission(10, PATIENCE)
     )
     settings = ListenerSettings("127.0.0.1", 0, None, protocol="websocket")
     ((host, port),) = await listeners.start([settings])

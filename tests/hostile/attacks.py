@@ -20,6 +20,7 @@ from appliance.mqtt.codec import Property, encode_varint
 from appliance.mqtt.framing import MAXIMUM_CONTROL
 from appliance.mqtt.packets import (
     V311,
+    Connect,
     Pingreq,
     Publish,
     Pubrec,
@@ -197,6 +198,19 @@ async def last_bytes_allowed(load: Load) -> None:
     will = Will(AREA, b"", properties={Property.USER_PROPERTY: pairs})
     packet = load.connect_packet("last", will=will, properties={Property.USER_PROPERTY: pairs})
     await _last_bytes(load, packet, 0)
+
+
+@attack(r"refused: SCRAM-SHA-256: user .* may not act for another", connect_timeout="10 s")
+async def scram_names(load: Load) -> None:
+    """The last byte of 245 CONNECTs with two long names for SCRAM that are costly to prepare."""
+    names = (letter * 85 for letter in ("\u0e01", "\u0e02"))
+    data = "n,a={},n={},r=x".format(*names).encode()
+    scram = {
+        Property.AUTHENTICATION_METHOD: "SCRAM-SHA-256",
+        Property.AUTHENTICATION_DATA: data,
+    }
+    packet = Connect("", version=5, clean_start=True, properties=scram).encode(5)
+    await _last_bytes(load, packet, 0x87)
 
 
 @attack(r"\(0x97\)|more than \d+ User Properties", at_least=1.0, **BOUNDED)

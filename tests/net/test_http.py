@@ -70,7 +70,7 @@ class WebHarness(Harness):
         self.listeners = Listeners(
             self.broker,
             self._ask,
-            lambda method, address, tls: None,
+            lambda method, address, tls, again: None,
             Admission(connections, connect_timeout, **limits),
             site=lambda: site,
         )
