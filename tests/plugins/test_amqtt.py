@@ -722,6 +722,26 @@ async def test_an_answer_in_the_background_that_turns_to_no(
         assert not await answered()  # too old to hold
 
 
+@pytest.mark.parametrize("waits", [False, True])
+async def test_what_the_rules_of_the_files_take_is_counted(
+    monkeypatch: pytest.MonkeyPatch, waits: bool
+) -> None:
+    """Once for each time that they are asked, whatever the plugins say to it."""
+    async with running({own(Gate): {"waits": waits}}) as rig:
+        allowed = Decision(True, "by many rules", cost=300)
+        monkeypatch.setattr(rig.files, "decide", lambda *question: allowed)
+        me, counters = Identity("bob", "b1"), rig.broker.counters
+        Gate.answers["no"] = False
+        for topic in ("yes", "no") * 2:
+            begun = counters.cost
+            rig.broker.router.decide(me, Action.SUBSCRIBE, topic)
+            assert counters.cost - begun == 300
+            begun = counters.cost
+            rig.frame._access.is_pending((me, Action.SUBSCRIBE, topic), lambda: None)
+            assert counters.cost - begun == 300
+            await until(lambda: rig.frame._access._asked == {})
+
+
 async def test_questions_and_answers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "MAX_QUERIES", 3)
     monkeypatch.setattr(access, "MAX_CLIENT_QUERIES", 2)
