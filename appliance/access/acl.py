@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Final
@@ -18,6 +18,9 @@ _WILD: Final = "who has + or # in the user name or client id gets nothing from p
 
 # Up to so many rules a linear scan is faster than a search in the tree.
 _FEW: Final = 4
+
+# Levels of the trees below that are passed in the time of one unit of `Counters.cost`.
+_LEVELS_PER_COST_UNIT: Final = 16
 
 # A level that no rule can name, as no filter may hold U+0000 [MQTT-4.7.3-2].
 _FRESH: Final = "\0"
@@ -38,6 +41,23 @@ _VERBS: Final = {
     Action.SUBSCRIBE: "subscribe to",
     Action.RECEIVE: "read",
 }
+
+
+class _Work:
+    """What was looked at for a decision."""
+
+    __slots__ = ("levels", "rules")
+
+    def __init__(self) -> None:
+        #: Rules that were looked at; one that two filters are compared for counts twice.
+        self.rules = 0
+        #: Levels of trees that were passed on the way to them.
+        self.levels = 0
+
+    @property
+    def cost(self) -> int:
+        """In units of `Counters.cost`."""
+        return self.rules + self.levels // _LEVELS_PER_COST_UNIT
 
 
 class _Level:
@@ -73,7 +93,7 @@ class _Group:
                 level = level.below.setdefault(key, _Level())
             level.places.append(place)
 
-    def about(self, filter: str) -> list[Rule]:
+    def about(self, filter: str, work: _Work) -> list[Rule]:
         """A superset of the rules that match the topic, or some topic of the filter."""
         if len(self.rules) <= _FEW:
             return self.rules
@@ -82,11 +102,13 @@ class _Group:
         for name in filter.split("/"):
             if name == "#":
                 while reached:
+                    work.levels += 1
                     level = reached.pop()
                     found += level.places
                     reached += level.below.values()
                 break
             above, reached = reached, []
+            work.levels += len(above)
             for level in above:
                 below = level.below
                 if "#" in below:
@@ -102,6 +124,7 @@ class _Group:
             found += level.places
             if "#" in level.below:  # `a/#` matches `a` too.
                 found += level.below["#"].places
+        work.levels += len(reached) + len(found)
         return [self.rules[place] for place in sorted(set(found))]
 
 
@@ -138,6 +161,87 @@ class _Applied:
 
     def __str__(self) -> str:
         return str(self.rule) if self.filter is not None else f"{self.rule} ({_UNFIT})"
+
+
+class _Denials:
+    """Rules that deny, in the order in which they apply, for what is denied of a wide filter.
+
+    They are a tree, so that each of many rules that allow is not compared with each of them.
+    """
+
+    def __init__(self, work: _Work) -> None:
+        self._work = work
+        self._rules: list[_Applied] = []
+        self._root = _Level()
+        #: The first of those that deny everything.
+        self._everything: int | None = None
+
+    def add(self, rule: _Applied) -> None:
+        """Add a rule that denies, which applies after those that were added before."""
+        place = len(self._rules)
+        self._rules.append(rule)
+        if rule.filter is None:
+            if self._everything is None:
+                self._everything = place
+            return
+        level = self._root
+        for name in rule.filter.split("/"):
+            below = level.below.get(name)
+            if below is None:
+                below = level.below[name] = _Level()
+            level = below
+        level.places.append(place)
+
+    def of_all(self, a: str, b: str) -> _Applied | None:
+        """The rule that denies the topics that two overlapping filters share; None if one of these
+        topics is not denied.
+
+        It is asked about one topic of each length. For a wildcard, that has a level that no rule
+        names. So a rule that matches it does so with wildcards, and matches all shared topics of
+        that length. Where no rule has so many levels, all greater lengths are equivalent; if
+        different rules deny different lengths, the one that denies the greatest is returned.
+        """
+        shared, is_open_ended = _shared(a, b)
+        nobody = len(self._rules)
+        # The first rule that denies a topic which begins as those so far, of any greater length.
+        lasting = nobody if self._everything is None else self._everything
+        reached = [self._root]
+        passed = 1
+        may_be_wild = not shared or shared[0][:1] != "$"  # [MQTT-4.7.2-1]
+        for name in shared:
+            above, reached = reached, []
+            for level in above:
+                below = level.below
+                if name in below:
+                    reached.append(below[name])
+                if may_be_wild:
+                    if "+" in below:
+                        reached.append(below["+"])
+                    if "#" in below and below["#"].places[0] < lasting:
+                        lasting = below["#"].places[0]
+            passed += len(reached)
+            may_be_wild = True
+        is_topic = shared not in ([], [""])  # a topic is never empty
+        while True:
+            denied_by = nobody
+            for level in reached:
+                if level.places and level.places[0] < denied_by:
+                    denied_by = level.places[0]
+                below = level.below
+                if "#" in below and below["#"].places[0] < lasting:  # `a/#` matches `a` too.
+                    lasting = below["#"].places[0]
+            if lasting < denied_by:
+                denied_by = lasting
+            if denied_by == nobody and is_topic:
+                break
+            if not is_open_ended or (not reached and lasting < nobody):
+                break
+            # Longer by one level.
+            reached = [level.below["+"] for level in reached if "+" in level.below]
+            passed += 1 + len(reached)
+            is_topic = True
+        self._work.levels += passed
+        return None if denied_by == nobody else self._rules[denied_by]
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,9 +349,14 @@ class Acl:
 
     def verdict(self, identity: Identity, action: Action, topic: str) -> ActionVerdict:
         """The decision with its rule; those that were passed over may be missing."""
+        return self._quick_verdict(identity, action, topic, _Work())
+
+    def _quick_verdict(
+        self, identity: Identity, action: Action, topic: str, work: _Work
+    ) -> ActionVerdict:
         shared = parse_shared(topic) if action is Action.SUBSCRIBE else None
-        rules = self._applied(identity, shared[1] if shared is not None else topic)
-        return self._verdict(identity, action, topic, rules)
+        rules = self._applied(identity, work, shared[1] if shared is not None else topic)
+        return self._verdict(identity, action, topic, rules, work)
 
     def _decide_receive(self, identity: Identity, topic: str) -> Decision:
         received = self._received
@@ -261,16 +370,20 @@ class Acl:
         decision = received.decisions.get(who)
         if decision is None:
             decision = self._decide(identity, Action.RECEIVE, topic)
-            received.decisions[who] = decision
+            # Who asks again has not caused its cost.
+            received.decisions[who] = replace(decision, cost=0)
         return decision
 
     def _decide(self, identity: Identity, action: Action, topic: str) -> Decision:
-        verdict = self.verdict(identity, action, topic)
-        return Decision(verdict.allowed, verdict.reason)
+        work = _Work()
+        verdict = self._quick_verdict(identity, action, topic, work)
+        return Decision(verdict.allowed, verdict.reason, cost=work.cost)
 
     def allows_some(self, identity: Identity, action: Action, filter: str) -> bool:
         """Whether the client may do this with some topic that matches the valid filter."""
-        return self._some(identity, action, filter, list(self._applied(identity, filter))).allowed
+        work = _Work()
+        rules = self._applied(identity, work, filter)
+        return self._some(identity, action, filter, rules, work).allowed
 
     def explain(self, identity: Identity, topic: str) -> Explanation:
         """Why the client may or may not read, write and subscribe; for a filter only subscribe.
@@ -282,16 +395,18 @@ class Acl:
         actions = [Action.SUBSCRIBE]
         if not topic.startswith("$share/") and "+" not in topic and "#" not in topic:
             actions[:0] = [Action.RECEIVE, Action.PUBLISH]
+        work = _Work()
         verdicts = (
-            self._verdict(identity, action, topic, self._applied(identity)) for action in actions
+            self._verdict(identity, action, topic, self._applied(identity, work), work)
+            for action in actions
         )
         return Explanation(identity, topic, tuple(verdicts))
 
     def _verdict(
-        self, identity: Identity, action: Action, topic: str, rules: Iterable[_Applied]
+        self, identity: Identity, action: Action, topic: str, rules: Iterable[_Applied], work: _Work
     ) -> ActionVerdict:
         if action is Action.SUBSCRIBE:
-            return self._some(identity, action, topic, list(rules))
+            return self._some(identity, action, topic, rules, work)
         needed = _NEEDED[action]
         passed: list[tuple[Rule, str]] = []
         for applied in rules:
@@ -307,37 +422,35 @@ class Acl:
         )
 
     def _some(
-        self, identity: Identity, action: Action, filter: str, rules: Sequence[_Applied]
+        self,
+        identity: Identity,
+        action: Action,
+        filter: str,
+        rules: Iterable[_Applied],
+        work: _Work,
     ) -> ActionVerdict:
         """The decision about all topics that match the filter: the one that allows something."""
         needed = _NEEDED[action]
         shared = parse_shared(filter)
         wanted = shared[1] if shared is not None else filter
-        denying = [deny for deny in rules if deny.rule.denies and deny.overlaps(wanted)]
-        depth = max((deny.filter.count("/") + 1 for deny in denying if deny.filter), default=0)
+        denials = _Denials(work)
         passed: list[tuple[Rule, str]] = []
         denied_by: _Applied | None = None
         for applied in rules:
             rule = applied.rule
             if rule.denies:
-                continue
-            if not rule.gives(needed):
+                # Before the rules that it holds for: the client's own come before the patterns that
+                # deny.
+                denials.add(applied)
+            elif not rule.gives(needed):
                 passed.append((rule, _ONLY[rule.permission]))
             elif applied.filter is None or not applied.overlaps(wanted):
                 passed.append((rule, applied.why_passed(wanted, "shares no topic with the filter")))
             else:
-                for topic in _samples(wanted, applied.filter, depth + 1):
-                    # The client's own rules come before the patterns that deny.
-                    denied_by = next(
-                        (
-                            deny
-                            for deny in denying
-                            if (rule.pattern or not deny.rule.pattern) and deny.matches(topic)
-                        ),
-                        None,
-                    )
-                    if denied_by is None:
-                        return ActionVerdict(action, True, rule, str(rule), tuple(passed))
+                work.rules += 1
+                denied_by = denials.of_all(wanted, applied.filter)
+                if denied_by is None:
+                    return ActionVerdict(action, True, rule, str(rule), tuple(passed))
                 passed.append((rule, f"all that it gives there is denied by {denied_by}"))
         if denied_by is not None:
             return ActionVerdict(action, False, denied_by.rule, str(denied_by), tuple(passed))
@@ -345,18 +458,23 @@ class Acl:
             action, False, None, self._no_rule(identity, action, filter), tuple(passed)
         )
 
-    def _applied(self, identity: Identity, about: str | None = None) -> Iterator[_Applied]:
+    def _applied(
+        self, identity: Identity, work: _Work, about: str | None = None
+    ) -> Iterator[_Applied]:
         """The rules for a client, in the order in which they apply.
 
-        With `about`, a topic or filter, rules that cannot match it may be left out.
+        With `about`, a topic or filter, rules that cannot match it may be left out. Each is counted
+        when it is taken.
         """
         own = self._own.get(identity.username)
         if own is not None:
-            for rule in own.rules if about is None else own.about(about):
+            for rule in own.rules if about is None else own.about(about, work):
+                work.rules += 1
                 yield _Applied(rule, rule.filter)
         patterns = self._patterns
         is_wild = _has_wildcard(identity.client_id) or _has_wildcard(identity.username or "")
-        for rule in patterns.rules if about is None else patterns.about(about):
+        for rule in patterns.rules if about is None else patterns.about(about, work):
+            work.rules += 1
             if identity.username is None and "%u" in rule.filter:
                 continue
             if is_wild and not rule.denies:
@@ -402,15 +520,11 @@ def _changes_levels(name: str) -> bool:
     return not name or "/" in name or _has_wildcard(name)
 
 
-def _samples(a: str, b: str, depth: int) -> Iterator[str]:
-    """Sample topics that two overlapping filters share: one of each length up to `depth` levels.
-
-    For a wildcard, a sample has a level that no rule names. So a rule that matches a sample does so
-    with wildcards, and matches all shared topics of that length. Beyond the depth of the deepest
-    rule all lengths are equivalent.
-    """
+def _shared(a: str, b: str) -> tuple[list[str], bool]:
+    """The levels of the shortest topic that two overlapping filters share, and whether they share
+    all longer ones that begin like it; a wildcard of both becomes a level that no rule names."""
     levels_a, levels_b = a.split("/"), b.split("/")
-    open_ended = levels_a[-1] == levels_b[-1] == "#"
+    is_open_ended = levels_a[-1] == levels_b[-1] == "#"
     for levels in (levels_a, levels_b):
         if levels[-1] == "#":
             levels.pop()
@@ -418,8 +532,4 @@ def _samples(a: str, b: str, depth: int) -> Iterator[str]:
         x if x != "+" else y if y != "+" else _FRESH
         for x, y in zip_longest(levels_a, levels_b, fillvalue="+")
     ]
-    more = max(1, depth - len(shared)) if open_ended else 0
-    for extra in range(more + 1):
-        topic = "/".join(shared + [_FRESH] * extra)
-        if topic:
-            yield topic
+    return shared, is_open_ended

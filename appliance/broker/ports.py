@@ -40,7 +40,10 @@ class Access(Protocol):
     epoch: int
 
     def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
-        """Decide immediately, without I/O; `topic` is a filter when `action` is SUBSCRIBE."""
+        """Decide immediately, without I/O; `topic` is a filter when `action` is SUBSCRIBE.
+
+        Where that takes longer the more rules there are, the decision tells its `cost`.
+        """
 
 
 class PendingDecisions(Protocol):

@@ -244,6 +244,7 @@ class Router:
         decision = self._faults.run(
             "broker.access", self.access.decide, identity, action, topic, otherwise=_FAULT
         )
+        self._counters.cost += decision.cost
         undecided = self._undecided
         is_asked = self.pending_decisions is not None and decision is not _FAULT
         if decision.pending and is_asked and undecided is not None and len(undecided) < UNDECIDED:

@@ -31,7 +31,8 @@ from appliance.mqtt.topics import check_filter, parse_shared
 #: The limit of levels in all filters of one SUBSCRIBE or UNSUBSCRIBE.
 MAXIMUM_LEVELS = 20_000
 
-#: The cost of adding or removing a subscription; each level of its filter adds one.
+#: The cost of adding or removing a subscription; each level of its filter adds one. The access
+#: rules add what their decision takes, see `Decision.cost`.
 SUBSCRIBE_COST = 20
 
 #: The cost of checking a filter, and of looking up its retained messages.
@@ -94,14 +95,16 @@ def subscribe(
     """
     turn = _Turn(broker)
     subscriptions = packet.subscriptions
-    for _ in _check(broker, [subscription.filter for subscription in subscriptions], turn):
-        yield None
+    yield from _check(broker, [subscription.filter for subscription in subscriptions], turn)
     asked = broker.router.pending_decisions
     if asked is not None:
         until = broker.now + asked.timeout
         for start in range(0, len(subscriptions), ASKED_AT_ONCE):
             questions = _questions(session, subscriptions[start : start + ASKED_AT_ONCE])
-            yield from answers(broker, lambda asking=questions: asking, wake, until)  # type: ignore[misc]
+            for step in answers(broker, lambda asking=questions: asking, wake, until):  # type: ignore[misc]
+                yield step
+                turn.begin()
+            yield from turn.spend(0)
     identifiers = (packet.properties or {}).get(Property.SUBSCRIPTION_IDENTIFIER)
     identifier = identifiers[0] if isinstance(identifiers, list) else 0
     rate, problem = _rate(packet.properties)
@@ -123,8 +126,7 @@ def subscribe(
             broker.log_rate_limited(session, "cannot subscribe to %s: %s", name, refusal)
             if may_explain and words is None:
                 words = in_words(f"{name}: {refusal}")
-            if turn.is_over(CHECK_COST):
-                yield None
+            yield from turn.spend(CHECK_COST)
             continue
         subscription.qos = min(subscription.qos, max_qos)
         is_new = subscription.filter not in session.subscriptions
@@ -134,8 +136,7 @@ def subscribe(
             granted.append((subscription, is_new))
         elif explains and words is None:  # SUBACK has one string: that of the first refusal
             words = in_words(f"{quote(subscription.filter)}: {reason}")
-        if turn.is_over(_cost(subscription.filter)):
-            yield None
+        yield from turn.spend(_cost(subscription.filter))
     yield Suback(packet.packet_id, codes, words)  # [MQTT-3.8.4-1], [MQTT-3.8.4-6]
     for subscription, is_new in granted:
         cost = RETAINED_COST
@@ -143,8 +144,7 @@ def subscribe(
             cost += len(session.replays) // 10
             session.pump()
         broker.replay_retained(session, subscription, is_new)
-        if turn.is_over(cost):
-            yield None
+        yield from turn.spend(cost)
     session.pump()
 
 
@@ -177,13 +177,11 @@ def unsubscribe(broker: Broker, session: Session, packet: Unsubscribe) -> Iterat
         ProtocolError: a filter is invalid, or there are too many; then none has any effect.
     """
     turn = _Turn(broker)
-    for _ in _check(broker, packet.filters, turn):
-        yield None
+    yield from _check(broker, packet.filters, turn)
     codes: list[int] = []
     for name in packet.filters:
         codes.append(broker.unsubscribe(session, name))
-        if turn.is_over(_cost(name)):
-            yield None
+        yield from turn.spend(_cost(name))
     yield Unsuback(packet.packet_id, codes)  # [MQTT-3.10.4-4], [MQTT-3.11.3-1]
 
 
@@ -193,20 +191,23 @@ def _cost(name: str) -> int:
 
 
 class _Turn:
-    """Counts cost, up to the limit of a turn."""
+    """A turn ends when its cost is used up: by what is spent here, and by all that the work on a
+    filter adds elsewhere, such as the rules that are looked at."""
 
     def __init__(self, broker: Broker) -> None:
         self._counters = broker.counters
-        self._left = COST_PER_TURN
+        self.begin()
 
-    def is_over(self, cost: int) -> bool:
-        """Add cost; True when the limit is reached, and then the next turn begins."""
+    def begin(self) -> None:
+        """A turn begins; others have had theirs."""
+        self._end = self._counters.cost + COST_PER_TURN
+
+    def spend(self, cost: int) -> Iterator[None]:
+        """Add cost; yields when the turn is over, and then the next one begins."""
         self._counters.cost += cost
-        self._left -= cost
-        if self._left > 0:
-            return False
-        self._left = COST_PER_TURN
-        return True
+        if self._counters.cost >= self._end:
+            yield None
+            self.begin()
 
 
 def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None]:
@@ -217,8 +218,7 @@ def _check(broker: Broker, filters: Sequence[str], turn: _Turn) -> Iterator[None
         )
     for name in filters:
         _check_filter(broker, name)
-        if turn.is_over(CHECK_COST + len(name) // LONG_FILTER):
-            yield
+        yield from turn.spend(CHECK_COST + len(name) // LONG_FILTER)
 
 
 def _check_filter(broker: Broker, topic_filter: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import TypeAlias
 
@@ -34,12 +34,14 @@ class Identity:
 class Decision:
     """Whether an operation is allowed; `reason` names the rule, for the log.
 
-    A `pending` refusal is provisional: it holds until the answer of a plugin arrives.
+    A `pending` refusal is provisional: it holds until the answer of a plugin arrives. `cost` is the
+    work of this decision beyond that of any other, in units of `Counters.cost`; who asks adds it.
     """
 
     allowed: bool
     reason: str
     pending: bool = False
+    cost: int = field(default=0, compare=False)
 
     def __bool__(self) -> bool:
         return self.allowed

@@ -7,6 +7,7 @@ import contextlib
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 from amqtt.broker import BrokerContext
@@ -101,8 +102,10 @@ class PluginAccess:
         if not self._is_blocking:
             answered, refusing = self._ask_now(identity, action, topic)
             if answered:
-                return Decision(False, f"refused by {refusing}") if refusing else decision
-        return self._verdict((identity, action, topic))
+                if not refusing:
+                    return decision
+                return Decision(False, f"refused by {refusing}", cost=decision.cost)
+        return replace(self._verdict((identity, action, topic)), cost=decision.cost)
 
     @property
     def timeout(self) -> float:
@@ -111,7 +114,9 @@ class PluginAccess:
 
     def is_pending(self, query: AccessQuery, wake: Callable[[], None]) -> bool:
         """Whether there is no answer yet; `wake` is then called when there may be one."""
-        if not self.decide(*query).pending:
+        decision = self.decide(*query)
+        self._broker.counters.cost += decision.cost
+        if not decision.pending:
             return False
         if query in self._asked:
             self._waiting.setdefault(query, {})[wake] = None

@@ -194,7 +194,7 @@ class ApplianceBroker(amqtt.broker.Broker):
                 + redacted(": ".join(filter(None, reasons)), self._guard.secrets)
             ) from None
         manager = self.plugins_manager
-        self._events = PluginEvents(manager, self._views, self._guard)
+        self._events = PluginEvents(manager, self._views, self._guard, broker.accounting)
         self._access = PluginAccess(
             files, broker, manager, self._views, self._guard, self._threads, answers
         )

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 from functools import partial
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from amqtt.broker import BrokerContext
 from amqtt.events import BrokerEvents, Events, MQTTEvents
@@ -14,6 +14,8 @@ from amqtt.mqtt.connect import ConnectPacket, ConnectPayload, ConnectVariableHea
 from amqtt.plugins.manager import PluginManager
 from amqtt.session import IncomingApplicationMessage
 
+from appliance.broker.accounting import Accounting
+from appliance.broker.accounts import Account, Quota
 from appliance.broker.message import Message
 from appliance.broker.session import Session
 from appliance.broker.values import Identity
@@ -24,9 +26,15 @@ from appliance.plugins.guard import PluginGuard
 
 log = logging.getLogger(__name__)
 
-#: The most events, and bytes of payload in them, that wait for plugins.
+#: The most events, and bytes of payload in them, that wait for plugins; of these a quarter is sure
+#: to each user, see `Quota`.
 MAX_EVENTS = 10_000
 MAX_EVENT_BYTES = 64 * 1024 * 1024
+
+#: The cost of making amqtt's objects of a message, see `Counters.cost`; and of a handler's task,
+#: most of which comes in the next rounds of the loop.
+MESSAGE_COST = 10
+HANDLER_COST = 2
 
 #: Seconds between two log lines about dropped events.
 LOST_LOG_INTERVAL = 60.0
@@ -44,19 +52,50 @@ _MESSAGES = frozenset(
 )
 
 
+class _Pending:
+    """What waits for plugins: handlers of events, and bytes of payload in these."""
+
+    __slots__ = ("bytes", "events")
+
+    def __init__(self) -> None:
+        self.events = 0
+        self.bytes = 0
+
+    def add(self, size: int) -> None:
+        self.events += 1
+        self.bytes += size
+
+    def remove(self, size: int) -> None:
+        self.events -= 1
+        self.bytes -= size
+
+
+_NOTHING: Final = _Pending()
+
+
 class PluginEvents:
     """The broker's `Observer`: fires amqtt's events, those that a plugin has a handler for."""
 
     def __init__(
-        self, plugins: PluginManager[BrokerContext], sessions: SessionViews, guard: PluginGuard
+        self,
+        plugins: PluginManager[BrokerContext],
+        sessions: SessionViews,
+        guard: PluginGuard,
+        accounting: Accounting,
     ) -> None:
         self._plugins = plugins
         self._sessions = sessions
         self._guard = guard
         self._wanted = frozenset(plugins._event_plugin_callbacks)
         self._wants_messages = not self._wanted.isdisjoint(_MESSAGES)
-        self._pending = 0
-        self._pending_bytes = 0
+        self._counters = accounting.counters
+        self._inside = accounting.accounts.inside
+        self._strangers = accounting.accounts.strangers
+        self._events = Quota.of(MAX_EVENTS, None)
+        self._bytes = Quota.of(MAX_EVENT_BYTES, None)
+        self._pending = _Pending()
+        #: The part of each user, by what is left of an account that ends meanwhile.
+        self._pending_of: dict[tuple[str | None, bool], _Pending] = {}
         self._lost = 0
         self._lost_logged_at = float("-inf")
         #: The message that is being published, and its publisher.
@@ -69,7 +108,7 @@ class PluginEvents:
 
     async def life_cycle(self, event: BrokerEvents) -> None:
         """Fire the event and wait for its handlers, up to the time limit."""
-        tasks = self._fire(event, 0, {})
+        tasks = self._fire(event, self._inside, 0, {})
         if tasks:
             _, late = await asyncio.wait(tasks, timeout=self._guard.timeout)
             if late:
@@ -91,20 +130,26 @@ class PluginEvents:
             header.will_flag, header.will_qos, header.will_retain_flag = True, will.qos, will.retain
             payload.will_topic, payload.will_message = will.topic, will.payload
         packet = ConnectPacket(variable_header=header, payload=payload)
-        self._notify(MQTTEvents.PACKET_RECEIVED, packet=packet)
+        self._notify(MQTTEvents.PACKET_RECEIVED, self._strangers, packet=packet)
 
     def connected(self, session: Session) -> None:
         """A client has connected."""
         view = self._sessions.of(session)
         self._notify(
-            BrokerEvents.CLIENT_CONNECTED, client_id=session.client_id, client_session=view
+            BrokerEvents.CLIENT_CONNECTED,
+            session.account,
+            client_id=session.client_id,
+            client_session=view,
         )
 
     def disconnected(self, session: Session) -> None:
         """A client has disconnected."""
         view = self._sessions.of(session)
         self._notify(
-            BrokerEvents.CLIENT_DISCONNECTED, client_id=session.client_id, client_session=view
+            BrokerEvents.CLIENT_DISCONNECTED,
+            session.account,
+            client_id=session.client_id,
+            client_session=view,
         )
 
     def subscribed(self, session: Session, topic_filter: str, qos: int) -> None:
@@ -112,6 +157,7 @@ class PluginEvents:
         if not session.is_inside:
             self._notify(
                 BrokerEvents.CLIENT_SUBSCRIBED,
+                session.account,
                 client_id=session.client_id,
                 topic=topic_filter,
                 qos=int(qos),
@@ -121,7 +167,10 @@ class PluginEvents:
         """A client has unsubscribed."""
         if not session.is_inside:
             self._notify(
-                BrokerEvents.CLIENT_UNSUBSCRIBED, client_id=session.client_id, topic=topic_filter
+                BrokerEvents.CLIENT_UNSUBSCRIBED,
+                session.account,
+                client_id=session.client_id,
+                topic=topic_filter,
             )
 
     def published(self, session: Session, message: Message) -> None:
@@ -143,18 +192,22 @@ class PluginEvents:
         published, self._published = self._published, None
         if BrokerEvents.RETAINED_MESSAGE not in self._wanted or message.topic.startswith("$SYS/"):
             return
-        source = None
+        self._counters.cost += MESSAGE_COST
+        source, account = None, self._inside
         if published is not None and published[0] is message:
             source = self._sessions.of_identity(cast(Identity, published[1].identity))
+            account = published[1].account
         self._notify(
             BrokerEvents.RETAINED_MESSAGE,
+            account,
             len(message.payload),
             client_id=None,
             retained_message=retained_message(source, message),
         )
 
     def _notify_message(self, session: Session, message: Message, *, allowed: bool) -> None:
-        size = len(message.payload)
+        self._counters.cost += MESSAGE_COST
+        account, size = session.account, len(message.payload)
         received = IncomingApplicationMessage(
             None, message.topic, message.qos, message.payload, message.retain
         )
@@ -162,23 +215,24 @@ class PluginEvents:
         if MQTTEvents.PACKET_RECEIVED in self._wanted:
             self._notify(
                 MQTTEvents.PACKET_RECEIVED,
+                account,
                 size,
                 packet=received.publish_packet,
                 session=self._sessions.of_identity(cast(Identity, session.identity)),
             )
         client_id = session.client_id
-        self._notify(BrokerEvents.MESSAGE_RECEIVED, size, client_id=client_id, message=received)
+        about = {"client_id": client_id, "message": received}
+        self._notify(BrokerEvents.MESSAGE_RECEIVED, account, size, **about)
         if allowed:
-            self._notify(
-                BrokerEvents.MESSAGE_BROADCAST, size, client_id=client_id, message=received
-            )
+            self._notify(BrokerEvents.MESSAGE_BROADCAST, account, size, **about)
 
-    def _notify(self, event: Events, size: int = 0, **arguments: object) -> None:
-        """Fire the event, or drop it if too many are pending; `size` is its payload in bytes."""
+    def _notify(self, event: Events, account: Account, size: int = 0, **arguments: object) -> None:
+        """Fire the event, or drop it if too many are pending; `size` is its payload in bytes, and
+        `account` that of the user who caused it."""
         if event not in self._wanted:
             return
-        if self._pending < MAX_EVENTS and self._pending_bytes + size <= MAX_EVENT_BYTES:
-            self._fire(event, size, arguments)
+        if self._has_room(account, size):
+            self._fire(event, account, size, arguments)
             return
         self._lost += 1
         now = asyncio.get_running_loop().time()
@@ -186,8 +240,15 @@ class PluginEvents:
             self._lost_logged_at = now
             log.warning("amqtt plugins are too slow: %d events were dropped", self._lost)
 
+    def _has_room(self, account: Account, size: int) -> bool:
+        """Whether the user may have one more event pending."""
+        own, total = self._pending_of.get(_key(account), _NOTHING), self._pending
+        return self._events.allows(own.events, total.events, 1) and self._bytes.allows(
+            own.bytes, total.bytes, size
+        )
+
     def _fire(
-        self, event: Events, size: int, arguments: dict[str, Any]
+        self, event: Events, account: Account, size: int, arguments: dict[str, Any]
     ) -> list[asyncio.Future[Any]]:
         """Let amqtt start the event's handlers; returns their tasks."""
         fired = self._plugins._fired_events
@@ -196,16 +257,24 @@ class PluginEvents:
         with contextlib.suppress(StopIteration):
             self._plugins.fire_event(event, **arguments).send(None)
         tasks = fired[before:]
+        self._counters.cost += HANDLER_COST * len(tasks)
         for task in tasks:
-            self._pending += 1
-            self._pending_bytes += size
-            task.add_done_callback(partial(self._done, event, size))
+            self._pending.add(size)
+            self._pending_of.setdefault(_key(account), _Pending()).add(size)
+            task.add_done_callback(partial(self._done, event, account, size))
         return tasks
 
-    def _done(self, event: Events, size: int, task: asyncio.Future[Any]) -> None:
-        self._pending -= 1
-        self._pending_bytes -= size
+    def _done(self, event: Events, account: Account, size: int, task: asyncio.Future[Any]) -> None:
+        self._pending.remove(size)
+        own = self._pending_of[_key(account)]
+        own.remove(size)
+        if not own.events:
+            del self._pending_of[_key(account)]
         if not task.cancelled():
             error = task.exception()
             if error is not None:
                 self._guard.log_failure(f"an amqtt plugin's handler of {event.value}", error)
+
+
+def _key(account: Account) -> tuple[str | None, bool]:
+    return account.username, account.is_inside

@@ -620,6 +620,53 @@ def test_an_acl_is_quick_where_it_is_long(tmp_path: Path) -> None:
     assert time.process_time() - started < 0.5  # It takes some 2 ms.
 
 
+def wide_rules(count: int) -> str:
+    return "\n".join([*(f"topic read r{i}/#" for i in range(count)), "topic deny +/secret/#"])
+
+
+def test_a_decision_tells_what_it_takes(tmp_path: Path) -> None:
+    """It grows with the rules that a wide filter has to be compared with, and only with these."""
+    acl = acl_of(tmp_path, wide_rules(300))
+    wide = acl.decide(NOBODY, Action.SUBSCRIBE, "+/secret/x")
+    assert not wide and 300 <= wide.cost <= 4 * 300
+    assert acl.decide(NOBODY, Action.SUBSCRIBE, "$share/g/+/secret/x").cost == wide.cost
+    assert acl.decide(NOBODY, Action.SUBSCRIBE, "r7/a").cost <= 4
+    assert acl.decide(NOBODY, Action.SUBSCRIBE, "#").cost < 100  # r0/# is enough; all are passed
+    assert acl.decide(NOBODY, Action.PUBLISH, "r7/a").cost <= 4
+    few = acl_of(tmp_path, wide_rules(3)).decide(NOBODY, Action.SUBSCRIBE, "+/secret/x")
+    assert not few and few.cost < 10
+
+
+def test_who_asks_again_is_not_charged_for_a_known_decision(tmp_path: Path) -> None:
+    acl = acl_of(tmp_path, "\n".join(f"topic write {'+/' * i}#" for i in range(9)))
+    topic = "/".join("x" * 9)
+    costs = [acl.decide(NOBODY, Action.RECEIVE, topic).cost for _ in range(2)]
+    assert costs[0] >= 9 and costs[1] == 0
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [f"topic deny r{i}/#\ntopic read r{i}/#" for i in range(1000)],
+        # Of all lengths up to the deepest rule's.
+        [
+            "topic deny +/#\ntopic deny " + "/".join("a" * 200),
+            *(f"topic {i}/#" for i in range(1000)),
+        ],
+    ],
+    ids=["pairs", "deep"],
+)
+def test_rules_that_deny_are_not_compared_with_each_that_allows(
+    tmp_path: Path, lines: list[str]
+) -> None:
+    acl = acl_of(tmp_path, "\n".join(lines))
+    started = time.process_time()
+    decision = acl.decide(NOBODY, Action.SUBSCRIBE, "#")
+    assert time.process_time() - started < 0.5  # It takes some 15 ms.
+    assert not decision and "deny" in decision.reason
+    assert decision.cost < 5 * 1000
+
+
 def test_include(tmp_path: Path) -> None:
     (tmp_path / "conf.d").mkdir()
     write(tmp_path / "conf.d" / "bob.conf", "user bob\ntopic b\n")

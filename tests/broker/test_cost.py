@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from typing import ClassVar
 
@@ -20,10 +21,12 @@ from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.session import REPLAYED_PER_TURN, Replay
 from appliance.broker.shared import MAXIMUM_CHECKED
-from appliance.broker.subscribing import LONG_FILTER
+from appliance.broker.subscribing import ASKED_AT_ONCE, LONG_FILTER
+from appliance.broker.values import AccessQuery, Action, Decision, Identity
 from appliance.mqtt import framing
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Publish, Pubrel, Subscribe, Subscription, Will
+from appliance.mqtt.packets import Publish, Pubrel, Suback, Subscribe, Subscription, Will
+from appliance.mqtt.reason import ReasonCode
 from appliance.mqtt.topics import STEP
 
 from .conftest import FakeAccess, Join, Peer, lasting
@@ -200,6 +203,59 @@ def test_an_alias_is_checked_where_it_is_given(join: Join, monkeypatch: pytest.M
     for _ in range(10):
         peer.send(Publish("", b"", 0, properties={Property.TOPIC_ALIAS: 1}))
     assert checked == ["a/b"]
+
+
+class ManyRules(FakeAccess):
+    """Takes long to decide about any filter. It is asked so often before a decision is there."""
+
+    COST = 300
+    timeout = 5.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = 0
+
+    def decide(self, identity: Identity, action: Action, topic: str) -> Decision:
+        self.asked += 1
+        return Decision(False, "many rules", cost=self.COST)
+
+    def is_pending(self, question: AccessQuery, wake: Callable[[], None]) -> bool:
+        self.broker.counters.cost += self.decide(*question).cost
+        return False
+
+    broker: Broker
+
+
+@pytest.mark.parametrize("is_asked_first", [False, True])
+def test_the_rules_that_are_looked_at_end_the_turn_of_a_subscribe(
+    join: Join, broker: Broker, is_asked_first: bool
+):
+    """Whether a plugin might have to be waited for or not."""
+    peer = join("peer")
+    access = ManyRules()
+    broker.router.access = access
+    access.broker = broker
+    if is_asked_first:
+        broker.router.pending_decisions = access
+    filters = [f"+/secret/{number}" for number in range(40)]
+    asked: list[int] = []
+    costs: list[int] = []
+    peer.transport.laters = 1
+    while peer.transport.laters:
+        begun, before = broker.counters.cost, access.asked
+        if not asked:
+            peer.transport.laters = 0
+            peer.send(Subscribe(1, [Subscription(name, 0) for name in filters]))
+        else:
+            peer.go_on()
+        asked.append(access.asked - before)
+        costs.append(broker.counters.cost - begun)
+        broker.counters.cost += 10 * COST_PER_TURN  # others have their turns
+    assert sum(asked) == len(filters) * (2 if is_asked_first else 1)
+    at_once = ASKED_AT_ONCE if is_asked_first else 1
+    assert max(costs) < COST_PER_TURN + at_once * (ManyRules.COST + 50)
+    assert min(asked[1:-1]) >= 3, "each turn is used"
+    assert peer.only(Suback).reason_codes == [ReasonCode.NOT_AUTHORIZED] * len(filters)
 
 
 @pytest.mark.parametrize("beginning", ["", "$share/g/"])

@@ -8,6 +8,7 @@ import logging
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -33,12 +34,13 @@ from appliance.access import AccessFileError, FileAccess, LoginPolicy, Passwords
 from appliance.app.main import App
 from appliance.broker import client as network_client
 from appliance.broker.broker import Broker
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.config import Settings, load
 from appliance.mqtt.codec import Property
-from appliance.mqtt.packets import Connect, Subscription, Will
+from appliance.mqtt.packets import Connect, Publish, Subscription, Will
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.listeners import Admission, Listeners, ListenerSettings
 from appliance.plugins import (
@@ -722,6 +724,26 @@ async def test_an_answer_in_the_background_that_turns_to_no(
         assert not await answered()  # too old to hold
 
 
+@pytest.mark.parametrize("waits", [False, True])
+async def test_what_the_rules_of_the_files_take_is_counted(
+    monkeypatch: pytest.MonkeyPatch, waits: bool
+) -> None:
+    """Once for each time that they are asked, whatever the plugins say to it."""
+    async with running({own(Gate): {"waits": waits}}) as rig:
+        allowed = Decision(True, "by many rules", cost=300)
+        monkeypatch.setattr(rig.files, "decide", lambda *question: allowed)
+        me, counters = Identity("bob", "b1"), rig.broker.counters
+        Gate.answers["no"] = False
+        for topic in ("yes", "no") * 2:
+            begun = counters.cost
+            rig.broker.router.decide(me, Action.SUBSCRIBE, topic)
+            assert counters.cost - begun == 300
+            begun = counters.cost
+            rig.frame._access.is_pending((me, Action.SUBSCRIBE, topic), lambda: None)
+            assert counters.cost - begun == 300
+            await until(lambda: rig.frame._access._asked == {})
+
+
 async def test_questions_and_answers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "MAX_QUERIES", 3)
     monkeypatch.setattr(access, "MAX_CLIENT_QUERIES", 2)
@@ -893,7 +915,7 @@ async def test_slow_plugins_lose_events_and_delay_nothing(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(events, "MAX_EVENTS", 20)
+    monkeypatch.setattr(events, "MAX_EVENTS", 40)  # half of which is lent to one user
     async with running({**amqtt_users, own(Slow): {}}, plugin_timeout=SHORT) as rig:
         bob = await rig.connect("bob:secret", "b1")
         await bob.subscribe([("a", 1)])
@@ -909,12 +931,84 @@ async def test_slow_plugins_lose_events_and_delay_nothing(
 async def test_events_are_bounded_in_bytes(
     amqtt_users: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events, "MAX_EVENT_BYTES", 1000)
+    monkeypatch.setattr(events, "MAX_EVENT_BYTES", 2000)  # half of which is lent to one user
     async with running({**amqtt_users, own(Slow): {}}, plugin_timeout=SHORT) as rig:
         bob = await rig.connect("bob:secret", "b1")
         for _ in range(5):
             await bob.publish("a", bytes(400), qos=1)
         assert len(rig.frame.plugins_manager._fired_events) == 2
+
+
+async def test_a_users_flood_leaves_the_events_of_others(
+    amqtt_users: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "MAX_EVENTS", 40)
+    both = {own(Slow): {}, own(Recorder): {}}
+    async with running({**amqtt_users, **both}, plugin_timeout=SHORT) as rig:
+        eve = await rig.connect("eve:apple", "e1")
+        await rig.frame.plugins_manager.wait_fired_events()
+        Recorder.told.clear()
+        await rig.connect("bob:secret", "b1")
+        bob = rig.broker.sessions["b1"]
+        for number in range(100):  # before a task of a handler has had its turn
+            rig.broker.publish(Message(f"{number}", b"x", retain=True), bob)
+        await until(lambda: bool(told("broker_message_received")))
+        # With five handlers for each, before half of what may wait for plugins is his.
+        assert 3 <= len(told("broker_message_received")) <= 5
+        await eve.disconnect()
+        await until(
+            lambda: "e1" in map(itemgetter("client_id"), told("broker_client_disconnected"))
+        )
+        assert rig.frame._events._pending_of  # those that the slow plugin has begun with
+        for task in list(rig.frame.plugins_manager._fired_events):
+            task.cancel()
+        await until(lambda: not rig.frame._events._pending_of)
+        assert (rig.frame._events._pending.events, rig.frame._events._pending.bytes) == (0, 0)
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+async def test_the_events_of_a_message_are_counted_as_work(
+    amqtt_users: dict[str, Any], tmp_path: Path, allowed: bool
+) -> None:
+    """amqtt's objects take ten times as long as the message, and each handler is a task."""
+    acl = lines(tmp_path / "acl.conf", "pattern readwrite yes")
+    topic = "yes" if allowed else "no"
+    costs = {}
+    for plugin in (Slow, Recorder, LifeCycle):
+        plugins = {**amqtt_users, own(plugin): {}}
+        async with running(plugins, acl=acl, plugin_timeout=SHORT) as rig:
+            await rig.connect("bob:secret", "b1")
+            bob = rig.broker.sessions["b1"]
+            for retain in (False, True):
+                rig.broker.publish(Message(topic, b"x", retain=retain), bob)  # finds the route
+                begun = rig.broker.counters.cost
+                rig.broker.publish(Message(topic, b"x", retain=retain), bob)
+                costs[plugin, retain] = rig.broker.counters.cost - begun
+            for task in list(rig.frame.plugins_manager._fired_events):
+                task.cancel()
+    added = {
+        (kind, retain): costs[kind, retain] - costs[LifeCycle, retain] for kind, retain in costs
+    }
+    one = events.MESSAGE_COST + events.HANDLER_COST
+    assert added[Slow, False] == added[Slow, True] == one
+    handlers = 3 if allowed else 2  # received as a packet, as a message, broadcast
+    several = events.MESSAGE_COST + handlers * events.HANDLER_COST
+    assert added[Recorder, False] == several
+    assert added[Recorder, True] == several + (one if allowed else 0)
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+async def test_a_client_that_publishes_much_takes_turns_with_the_events_of_that(
+    amqtt_users: dict[str, Any], qos: int
+) -> None:
+    async with running({**amqtt_users, own(Recorder): {}}) as rig:
+        await rig.connect("bob:secret", "b1")
+        client = rig.broker.sessions["b1"].link._client  # type: ignore[union-attr]
+        client.receive(Publish("a", b"x", qos, packet_id=1 if qos else 0).encode(4) * 1000)
+        per_message = events.MESSAGE_COST + 3 * events.HANDLER_COST
+        begun = len(rig.frame.plugins_manager._fired_events) // 3
+        assert 0 < begun <= COST_PER_TURN // per_message + 1
+        await until(lambda: len(told("broker_message_received")) == 1000)
 
 
 async def test_a_broken_handler_is_told_once(
