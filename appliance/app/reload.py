@@ -18,6 +18,8 @@ from appliance.access.enrolments import Enrolments
 from appliance.app import wiring
 from appliance.app.links import Links
 from appliance.broker.broker import Broker
+from appliance.broker.link import Link
+from appliance.broker.session import Session
 from appliance.certs import CertificateError, LoadedTls, TlsContexts
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import ConfigError, Settings
@@ -181,7 +183,9 @@ class Reload:
         if parts.tls is not None and read.tls is not None:
             changed += self._take_certificates(parts.tls, read.tls)
         rights = parts.access.adopt(read.rules)
-        changed += self._take_access(rights)
+        changed += _of_users(rights)
+        # Begins when others have a turn, which is below: the new rules are in force by then.
+        closing = self._close_removed(rights.users_removed)
         if parts.bridge is not None:
             parts.bridge.tell_home_assistant(settings.bridge.home_assistant)
             parts.bridge.replace(ros_settings.routes(settings))
@@ -196,6 +200,8 @@ class Reload:
         parts.announce()
         if parts.audit is not None and changed:
             parts.audit.changed(", ".join(changed), **asdict(rights))
+        if closing is not None:  # which goes on if the caller is gone, who may be one of them
+            await asyncio.wait({closing})
         return changed
 
     def _take_certificates(self, tls: TlsContexts, loaded: LoadedTls) -> list[str]:
@@ -209,26 +215,49 @@ class Reload:
         listeners.scheduler.in_background(listeners.check_certificates())
         return ["certificates"]
 
-    def _take_access(self, changes: Changes) -> list[str]:
-        """Disconnect removed users; returns what has changed. Rights: `rules_changed`."""
-        removed = set(changes.users_removed)  # plugins may know users that the file has not
-        for session in list(self._parts.broker.sessions.values()):
-            # A session inside the appliance has not logged in: the rules alone decide about it.
-            if session.is_inside or session.identity is None:
-                continue
-            if session.identity.username in removed:
-                session.close_link(ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed")
-        words = {
-            "users_added": "new users: ",
-            "users_removed": "users removed: ",
-            "passwords_changed": "new passwords of: ",
-        }
-        changed = [
-            text + ", ".join(names)
-            for field, text in words.items()
-            if (names := getattr(changes, field))
+    def _close_removed(self, names: list[str]) -> asyncio.Task[None] | None:
+        """Close the connections of removed users, in the background: a user may have thousands.
+
+        Only those that there are now: who logs in from now on may do so by the new files, such as
+        by a certificate.
+        """
+        parts, removed = self._parts, set(names)
+        if not removed:
+            return None
+        # Plugins may know users that the file has not, so only those count that it had. And a
+        # session inside the appliance has not logged in: the rules alone decide about it.
+        connected = [
+            (session, session.link)
+            for session in parts.broker.sessions.values()
+            if session.identity is not None
+            and session.identity.username in removed
+            and not session.is_inside
+            and session.link is not None
         ]
-        return changed + (["access rules"] if changes.rules_changed else [])
+
+        def close(each: tuple[Session, Link]) -> None:
+            session, link = each
+            if session.link is link:
+                reason = ReasonCode.ADMINISTRATIVE_ACTION, "the user was removed"
+                parts.broker.faults.run("reload.close", link.close, *reason, otherwise=None)
+
+        scheduler = parts.listeners.scheduler
+        return scheduler.in_background(scheduler.in_pieces(connected, close))
+
+
+def _of_users(changes: Changes) -> list[str]:
+    """What has changed of users and rules, in words."""
+    words = {
+        "users_added": "new users: ",
+        "users_removed": "users removed: ",
+        "passwords_changed": "new passwords of: ",
+    }
+    changed = [
+        text + ", ".join(names)
+        for field, text in words.items()
+        if (names := getattr(changes, field))
+    ]
+    return changed + (["access rules"] if changes.rules_changed else [])
 
 
 def _read(parts: ReloadParts) -> _LoadedFiles:

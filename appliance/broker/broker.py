@@ -493,22 +493,15 @@ class Broker:
 
     def _giver(self, *, absent_too: bool) -> Callable[[Delivery], bool]:
         """Return a function that delivers a message to another member; True if that succeeded."""
-        known: dict[Share, Heirs] = {}
+        heirs = Heirs(absent_too=absent_too)
 
         def give(delivery: Delivery) -> bool:
             message, _, _, _, share = delivery
             assert isinstance(share, Share)
             if self.accounting.has_expired(message):
                 return True
-            heirs = known.get(share)
-            if heirs is None:
-                members = share.targets()
-                self.counters.cost += len(members) // CHECKS_PER_COST_UNIT
-                if not absent_too:
-                    members = [member for member in members if member[0].link is not None]
-                heirs = known[share] = Heirs(share, members)
             # Only candidates are checked against the rules: a group may have thousands of members.
-            target = heirs.choose(message, self.router.may_receive)
+            target = heirs.choose(share, message, self.router.may_receive)
             self.counters.cost += 1 + heirs.checked // CHECKS_PER_COST_UNIT
             return target is not None and self._deliver_shared(target, message, share)
 

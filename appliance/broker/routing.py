@@ -121,7 +121,7 @@ class Router:
         if share is None:
             share = self.shares[topic_filter] = Share(topic_filter)
             self._subscriptions.add(shared[1], topic_filter, share)
-        share.members[session] = subscription
+        share.join(session, subscription)
 
     def leave(self, session: Session, topic_filter: str) -> None:
         """Remove a subscription from the tree, or a member from its group; may be called twice."""
@@ -130,7 +130,7 @@ class Router:
         if share is None:
             self._subscriptions.remove(topic_filter, session)
             return
-        share.members.pop(session, None)
+        share.leave(session)
         if not share.members:
             _, inner = parse_shared(topic_filter) or ("", "")
             self._subscriptions.remove(inner, topic_filter)

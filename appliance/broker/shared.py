@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -17,6 +16,13 @@ Target: TypeAlias = "tuple[Session, int, bool, list[int] | None]"
 #: Members that are checked for one message, if one of them can receive it.
 MAXIMUM_CHECKED = 128
 
+#: Members of a list of ranks that take as long as looking at one.
+LISTED_PER_CHECK = 8
+
+#: Answers that a member may not receive a topic while messages are passed on, after which no more
+#: members are asked about one whose next member may not.
+MAXIMUM_FORBIDDEN = 4096
+
 
 def as_target(session: Session, subscription: Subscription) -> Target:
     """A member of a group as the target of a message."""
@@ -30,9 +36,24 @@ class Share:
     def __init__(self, topic_filter: str) -> None:
         self.filter = topic_filter
         self.members: dict[Session, Subscription] = {}
+        #: The members whose subscription is of QoS 0.
+        self.of_qos_0: set[Session] = set()
         self._next = 0
         #: Members that the last `choose` checked.
         self.checked = 0
+
+    def join(self, session: Session, subscription: Subscription) -> None:
+        """Add a member, or replace its subscription."""
+        self.members[session] = subscription
+        if subscription.qos:
+            self.of_qos_0.discard(session)
+        else:
+            self.of_qos_0.add(session)
+
+    def leave(self, session: Session) -> None:
+        """Remove a member; does nothing if it is none."""
+        self.members.pop(session, None)
+        self.of_qos_0.discard(session)
 
     def targets(self) -> list[Target]:
         """All members as targets of a message."""
@@ -80,66 +101,120 @@ class Share:
 
 
 class Heirs:
-    """The members of a group while messages that another one leaves are passed on to them.
+    """The members of groups while messages that another one leaves are passed on to them.
 
     `choose` finds the one that `Share.choose` would find among up to MAXIMUM_CHECKED members. While
     messages are handed over no member gets room or becomes ready. So one that has refused a message
-    is not asked again for any of about that size, and one that is not ready any more is looked for
-    among the others: all messages together take members and messages, and not their product.
+    is not asked again for any of about that size, in whichever group, and one that is not ready any
+    more is looked for among the others: all messages together take members and messages, and not
+    their product. A session is examined once, be it a member of a thousand groups.
     """
 
-    __slots__ = ("_by_size", "_members", "_share", "checked")
+    __slots__ = ("_absent_too", "_forbidden", "_forbidden_count", "_groups", "_ranks", "checked")
 
-    def __init__(self, share: Share, members: list[Target]) -> None:
-        self._share = share
-        self._members = members
-        #: By size, the indexes of members that may have room, by their rank (see `_rank`), sorted.
-        self._by_size: dict[int, list[list[int]]] = {}
+    def __init__(self, *, absent_too: bool) -> None:
+        self._absent_too = absent_too
+        self._groups: dict[Share, _Group] = {}
+        #: By size (0 for members with QoS 0, which need no room), the rank of each session when it
+        #: was last looked at; 0 for one that has refused a message of that size.
+        self._ranks: dict[int, dict[Session, int]] = {0: {}}
+        #: By topic, those who may not receive it; and how many they are in all.
+        self._forbidden: dict[str, set[Session]] = {}
+        self._forbidden_count = 0
         #: Members that the last `choose` looked at.
         self.checked = 0
 
     def choose(
-        self, message: Message, may_receive: Callable[[Session, str], bool]
+        self, share: Share, message: Message, may_receive: Callable[[Session, str], bool]
     ) -> Target | None:
         """The member that gets the message, round robin; None when no member can take it."""
+        self.checked = 0
+        group = self._groups.get(share)
+        if group is None:
+            group = self._groups[share] = _Group(share)
         # Four sizes from each power of two to the next: to tell all sizes apart would take as many
         # checks as there are sizes, for each member.
         shift = max(message.size.bit_length() - 3, 0)
         size = message.size >> shift << shift
-        self.checked = 0
-        ranked = self._by_size.get(size)
-        if ranked is None:
-            ranked = self._by_size[size] = [[], [], [], []]
-            for index, member in enumerate(self._members):
-                ranked[_rank(member[0], member[1])].append(index)
-            self.checked = len(self._members)
-        share = self._share
-        count = len(self._members)
-        forbidden = 0
-        for rank in (3, 2, 1):
-            candidates = ranked[rank]
-            position = bisect_left(candidates, share._next % count) if candidates else 0
-            for _ in range(len(candidates)):
-                self.checked += 1
-                position %= len(candidates)
-                index = candidates[position]
-                member = self._members[index]
-                session = member[0]
-                rank_now = _rank(member[0], member[1])
-                if rank_now < rank:
-                    del candidates[position]
-                    insort(ranked[rank_now], index)
-                elif member[1] and not session.has_room(message):
-                    del candidates[position]
-                elif may_receive(session, message.topic):
-                    share._next = (index + 1) % count
-                    return member
-                else:
-                    position += 1
-                    forbidden += 1
-                    if forbidden >= MAXIMUM_CHECKED:
-                        return None
-        return None
+        ranks = group.ranks.get(size)
+        if ranks is None:
+            ranks = group.ranks[size] = self._ranks_of(group, size)
+        index = self._find(share, group, ranks, size, message, may_receive)
+        if index < 0:
+            return None
+        share._next = (index + 1) % len(ranks)
+        session = group.sessions[index]
+        subscription = share.members.get(session)
+        return as_target(session, subscription) if subscription is not None else None
+
+    def _ranks_of(self, group: _Group, size: int) -> bytearray:
+        """The rank of each member of the group, for messages of about this size."""
+        known, of_qos_0 = self._ranks.setdefault(size, {}), self._ranks[0]
+        self.checked += len(group.sessions) // LISTED_PER_CHECK
+        try:
+            if not group.of_qos_0:
+                return bytearray(map(known.__getitem__, group.sessions))
+            tables = (known, of_qos_0)
+            return bytearray([tables[s in group.of_qos_0][s] for s in group.sessions])
+        except KeyError:  # some are looked at for the first time
+            for session in group.sessions:
+                is_of_qos_0 = session in group.of_qos_0
+                table = of_qos_0 if is_of_qos_0 else known
+                if session not in table:
+                    self.checked += 1
+                    table[session] = _rank(session, 0 if is_of_qos_0 else 1)
+            return self._ranks_of(group, size)
+
+    def _find(
+        self,
+        share: Share,
+        group: _Group,
+        ranks: bytearray,
+        size: int,
+        message: Message,
+        may_receive: Callable[[Session, str], bool],
+    ) -> int:
+        """The index of the member that gets the message; -1 when no member can take it."""
+        forbidden = self._forbidden.setdefault(message.topic, set())
+        passed_over = 0
+        begin = share._next % (len(ranks) or 1)
+        for rank in (3, 2, 1) if self._absent_too else (3, 2):
+            for start, end in ((begin, len(ranks)), (0, begin)):
+                index = start - 1
+                while (index := ranks.find(rank, index + 1, end)) >= 0:
+                    session = group.sessions[index]
+                    qos = 0 if session in group.of_qos_0 else 1
+                    if session not in forbidden:
+                        self.checked += 1
+                        rank_now = _rank(session, qos)
+                        if rank_now >= rank and qos and not session.has_room(message):
+                            rank_now = 0
+                        if rank_now < rank:
+                            self._ranks[size if qos else 0][session] = ranks[index] = rank_now
+                            continue
+                        if may_receive(session, message.topic):
+                            return index
+                        forbidden.add(session)
+                        self._forbidden_count += 1
+                        if self._forbidden_count > MAXIMUM_FORBIDDEN:
+                            return -1
+                    passed_over += 1
+                    if passed_over >= MAXIMUM_CHECKED:
+                        return -1
+        self.checked += passed_over // LISTED_PER_CHECK
+        return -1
+
+
+class _Group:
+    """The members of one group, as they are when the first message is passed on."""
+
+    __slots__ = ("of_qos_0", "ranks", "sessions")
+
+    def __init__(self, share: Share) -> None:
+        self.sessions = list(share.members)
+        self.of_qos_0 = share.of_qos_0
+        #: By size, the rank of each member (see `_rank`); 0 for one that has no room.
+        self.ranks: dict[int, bytearray] = {}
 
 
 def _rank(session: Session, qos: int) -> int:

@@ -208,7 +208,7 @@ class HttpHandler(WebSocketHandler, Protocol):
 class HttpScheduler(LayerScheduler, Protocol):
     """The scheduler as this layer sees it."""
 
-    def in_background(self, work: Coroutine[object, object, None]) -> None:
+    def in_background(self, work: Coroutine[object, object, None]) -> object:
         """Run it as a task; it must not raise."""
 
     def has_room(self, account: Account, size: int) -> bool:

@@ -52,9 +52,6 @@ HANDSHAKES = 64
 #: they wait for the network, or are not meant to end.
 HANDSHAKE_STALL = 0.25
 
-#: Certificates that are checked again in one turn, at most 0.2 ms each.
-CHECKED_A_TURN = 16
-
 #: Seconds by which one address may exceed `limits.connection_rate` in a burst.
 CONNECTION_BURST = 5.0
 
@@ -356,13 +353,14 @@ class Listeners:
 
     async def check_certificates(self) -> None:
         """Close connections whose client's certificate is not, or no longer, accepted."""
-        for number, member in enumerate(list(self.scheduler.connections)):
+
+        def check(member: ScheduledConnection) -> None:
             try:
                 member.check_certificate()
             except Exception as error:
                 member.fault("connection.certificate", error)
-            if number % CHECKED_A_TURN == CHECKED_A_TURN - 1:
-                await asyncio.sleep(0)
+
+        await self.scheduler.in_pieces(list(self.scheduler.connections), check)
 
     async def stop(self) -> None:
         """Close all listeners and connections; may be called twice."""

@@ -13,14 +13,15 @@ import math
 import socket
 import ssl
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from functools import partial
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, TypeVar
 
 from async_timeout import timeout
 
 from appliance.broker.accounts import Account
 from appliance.broker.broker import Broker
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Anonymous
 from appliance.broker.ports import Exchange
 from appliance.broker.values import Identity, Refusal
@@ -29,6 +30,8 @@ from appliance.mqtt.packets import Connect
 from appliance.net.callbacks import Entries
 from appliance.net.layers import Schedulable, UpperLayer
 from appliance.net.lingering import LingeringClose
+
+T = TypeVar("T")
 
 #: The most messages of one client between two checks of its rate and of the memory in use.
 FEW_MESSAGES = 64
@@ -252,11 +255,28 @@ class Scheduler:
             if self._turn_queue:
                 self._schedule_turns()
 
-    def in_background(self, work: Coroutine[object, object, None]) -> None:
-        """Run a connection's handshake or login as a background task."""
+    def in_background(self, work: Coroutine[object, object, None]) -> asyncio.Task[None]:
+        """Run a connection's handshake or login, or work for many, as a background task."""
         task = self.entries.task("scheduler.background", work)
         self.tasks.add(task)
         self.entries.when_done("scheduler.background_end", task, self.tasks.discard, task)
+        return task
+
+    async def in_pieces(self, items: Iterable[T], work: Callable[[T], object]) -> None:
+        """Do the work, which catches its own faults, for each item; clients go on in between.
+
+        When an item's turn comes much may have changed: the work has to look at it again.
+        """
+        counters = self.broker.counters
+        end = counters.cost + COST_PER_TURN
+        for item in items:
+            work(item)
+            counters.cost += 1
+            if counters.cost > end:
+                self.broker.flush()
+                await asyncio.sleep(0)
+                end = counters.cost + COST_PER_TURN
+        self.broker.flush()
 
     def count_output(self, account: Account, size: int) -> None:
         """Add bytes (or subtract, if negative) that wait to be read by a client of the account."""

@@ -13,13 +13,13 @@ import pytest
 
 from appliance.access import Acl
 from appliance.broker import shared
-from appliance.broker.broker import Broker
+from appliance.broker.broker import CHECKS_PER_COST_UNIT, Broker
 from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Limits
 from appliance.broker.message import Message
 from appliance.broker.routing import CACHED_TOPIC
 from appliance.broker.session import Session
-from appliance.broker.shared import MAXIMUM_CHECKED, Share, Target
+from appliance.broker.shared import MAXIMUM_CHECKED, Share
 from appliance.broker.values import Action, Decision, Identity
 from appliance.mqtt.codec import Property
 from appliance.mqtt.packets import Publish, Subscription
@@ -306,11 +306,14 @@ def _count_questions(access: FakeAccess) -> Counter[str]:
 class _AsksAll:
     """The slow twin of what chooses who gets the messages that a member leaves."""
 
-    def __init__(self, share: Share, members: list[Target]) -> None:
-        self.share, self.members, self.checked = share, members, 0
+    def __init__(self, *, absent_too: bool) -> None:
+        self.absent_too, self.checked = absent_too, 0
 
-    def choose(self, message: Message, may_receive: Callable[[Session, str], bool]):
-        return self.share.choose(self.members, message, may_receive)
+    def choose(self, share: Share, message: Message, may_receive: Callable[[Session, str], bool]):
+        def may(session: Session, topic: str) -> bool:
+            return (self.absent_too or session.link is not None) and may_receive(session, topic)
+
+        return share.choose(share.targets(), message, may)
 
 
 def _handed_over(seed: int) -> list[object]:
@@ -418,3 +421,96 @@ def test_to_leave_takes_members_and_messages_and_not_their_product(
     kinds = 1 if len(sizes) == 1 else 20  # sizes that are told apart
     assert looked["members"] <= 2 * kinds * len(members) + messages < len(members) * messages
     assert messages <= broker.counters.cost - begun <= 2 * messages + kinds * len(members)
+
+
+def _leaver(join: Join, groups: int) -> Peer:
+    """A client in so many groups, which has a message of each and has acknowledged none."""
+    leaving = join("leaving", **lasting(5))
+    for number in range(groups):
+        leaving.subscribe(f"$share/g{number}/a", 1)
+    assert join("publisher").publish("a", b"x", 1) == 0
+    session = leaving.session
+    assert len(session.queue) + len(session.inflight) == groups
+    return leaving
+
+
+@pytest.mark.patches
+@pytest.mark.parametrize("qos", [0, 1, 2, None], ids=["0", "1", "2", "mixed"])
+@pytest.mark.parametrize("state", ["ready", "busy", "full", "absent", "forbidden"])
+@pytest.mark.parametrize("ends", [False, True], ids=["leaves", "ends"])
+def test_to_leave_many_groups_examines_who_is_in_all_of_them_once(
+    join: Join,
+    broker: Broker,
+    access: FakeAccess,
+    monkeypatch: pytest.MonkeyPatch,
+    qos: int | None,
+    state: str,
+    ends: bool,
+):
+    """Whoever can have the messages: it took groups and members once, and their product before."""
+    groups, count = 200, 40
+    leaving = _leaver(join, groups)
+    members = [join(f"m{n}", user=f"m{n}", **lasting(5)) for n in range(count)]
+    for index, member in enumerate(members):
+        if state == "forbidden":
+            access.deny(f"m{index}", Action.RECEIVE, "a")
+        for number in range(groups):
+            wanted = index % 3 if qos is None else qos
+            broker.subscribe(member.session, Subscription(f"$share/g{number}/a", wanted))
+        waiting = {"busy": member.session.window + 1, "full": broker.limits.queue_messages * 2}
+        for _ in range(waiting.get(state, 0)):
+            member.session.deliver(Message("own", b"", 1), 1, False, None)
+        if state == "absent":
+            member.lose()
+    looked = Counter[str]()
+    rank, decide = shared._rank, broker.router.may_receive
+    monkeypatch.setattr(shared, "_rank", lambda *a: (looked.update(["members"]), rank(*a))[1])
+    monkeypatch.setattr(
+        broker.router, "may_receive", lambda *a: (looked.update(["rules"]), decide(*a))[1]
+    )
+    held = len(leaving.session.queue) + len(leaving.session.inflight)
+    begun = broker.counters.cost
+    if ends:
+        join("leaving")  # anew
+    else:
+        leaving.lose()
+    cost = broker.counters.cost - begun
+    passes = 1 + ends
+    # Each message costs something, and a look at the group's list of ranks; QoS 0 and 1 are apart.
+    assert looked["members"] <= passes * 2 * (groups + 2 * count) < groups * count // 4
+    assert looked["rules"] <= passes * (groups + count)
+    each = 2 + 2 * count // shared.LISTED_PER_CHECK // CHECKS_PER_COST_UNIT
+    assert cost <= passes * (groups * (each + 3) + 4 * count) < groups * count // 2
+    if ends:
+        return
+    left = len(leaving.session.queue) + len(leaving.session.inflight)
+    nobody = state in ("absent", "forbidden") or (state == "full" and qos in (1, 2))
+    assert left == (held if nobody else 0)
+
+
+def test_what_many_groups_leave_is_neither_lost_nor_doubled_nor_reordered(
+    join: Join,
+):
+    """Of each group each message comes once, in its order, whoever gets it, and it is stored."""
+    groups = 50
+    leaving = join("leaving", **lasting(5))
+    for number in range(groups):
+        leaving.subscribe(f"$share/g{number}/a/{number}", 1)
+    publisher = join("publisher")
+    for text in (b"1", b"2", b"3"):
+        for number in range(groups):
+            assert publisher.publish(f"a/{number}", text, 1) == 0
+    members = [join(f"m{number}", **lasting(5)) for number in range(3)]
+    for member in members:
+        for number in range(groups):
+            member.subscribe(f"$share/g{number}/a/{number}", 1)
+    leaving.lose()
+    assert not leaving.session.queue and not leaving.session.inflight
+    heard = {member.client.session: member.drain() for member in members}
+    count = Counter((each.topic, each.payload) for came in heard.values() for each in came)
+    assert len(count) == 3 * groups and set(count.values()) == {1}
+    for came in heard.values():
+        assert len(came) >= groups - members[0].session.window, "who can send at once has more"
+        for number in range(groups):
+            texts = [each.payload for each in came if each.topic == f"a/{number}"]
+            assert texts == sorted(texts)
