@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import orjson
 
 from appliance.access import FileAccess
 from appliance.access.enrolments import Enrolments
@@ -22,11 +25,14 @@ from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
 from appliance.management.tokens import TokenVerbs
 from appliance.management.users import UserVerbs
-from appliance.management.verbs import Arguments, Caller, Verb, Verbs
+from appliance.management.verbs import LONGEST_ANSWER, Arguments, Caller, Verb, Verbs
 from appliance.net.callbacks import Entries
 from appliance.ops.audit import Audit
+from appliance.ros.announcements import TURN
 from appliance.ros.bridge import Bridge
 from appliance.ros.calls.dispatcher import CallError
+from appliance.ros.status import topic_status
+from appliance.ros.topics.flow import bridged
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,13 +106,14 @@ class ApplianceVerbs:
     async def _status(self, caller: Caller, _: Arguments) -> dict[str, object]:
         return await self._parts.status.report()
 
-    async def _routes(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
+    async def _routes(self, caller: Caller, _: Arguments) -> list[Any]:
         bridge = self._running_bridge()
-        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
-        return topics + [dict(entry) for entry in bridge.calls.bridged()]
+        # Which topics there are is decided now; only their entries are made later.
+        topics = (topic_status(topic, flow) for topic, flow in list(bridged(bridge.flows())))
+        return await _listed(caller, chain(topics, bridge.calls.bridged()))
 
-    async def _skipped(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
-        return [asdict(skip) for skip in self._running_bridge().skips()]
+    async def _skipped(self, caller: Caller, _: Arguments) -> list[Any]:
+        return await _listed(caller, self._running_bridge().skips())
 
     async def _upstream(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
         uplinks = self._parts.upstreams
@@ -129,3 +136,23 @@ class ApplianceVerbs:
         if bridge.problem is not None:
             raise CallError("unavailable", f"there is no bridge to ROS: {bridge.problem}")
         return bridge
+
+
+async def _listed(caller: Caller, entries: Iterable[object]) -> list[Any]:
+    """The entries as JSON values, made in several turns: a robot may have thousands.
+
+    Raises CallError as soon as they are more than a client is sent. On the control socket there is
+    no limit.
+    """
+    listed: list[Any] = []
+    size = 0
+    for entry in entries:
+        if listed and not len(listed) % TURN:
+            await caller.turn()
+        payload = orjson.dumps(entry)
+        size += len(payload) + 1
+        if size > LONGEST_ANSWER and caller.identity is not None:
+            text = f"the answer has more than {LONGEST_ANSWER} bytes, which are the most"
+            raise CallError("too_large", text)
+        listed.append(orjson.loads(payload))
+    return listed

@@ -26,6 +26,7 @@ from appliance.mdns.process import AnnouncerProcess
 from appliance.net.listeners import Listeners
 from appliance.ros.bridge import Bridge
 from appliance.ros.status import RouteStatus
+from appliance.ros.topics.flow import bridged
 from appliance.store import SessionStore
 from appliance.upstream.status import warnings_of as upstream_warnings
 
@@ -169,10 +170,10 @@ class Status:
 
     def _ros_rates(self) -> dict[str, float]:
         """Rates of the bridge; the other metrics are those of network clients."""
-        topics = self._parts.bridge.topics() if self._parts.bridge is not None else []
+        flows = self._parts.bridge.flows() if self._parts.bridge is not None else []
         rates = {"to_mqtt": 0.0, "to_ros": 0.0}
-        for topic in topics:
-            rates[topic.direction] += topic.rate
+        for topic, flow in bridged(flows):
+            rates[topic.direction] += flow.meter.rates[0]
         return {
             "from_ros_a_second": round(rates["to_mqtt"], 1),
             "to_ros_a_second": round(rates["to_ros"], 1),

@@ -26,8 +26,8 @@ _MOST_PASSED: Final = 100
 #: The cost of a decision about a topic that was not asked about before.
 _COST: Final = 10
 
-#: Seconds after which the other questions of a call wait for the loop's next round: to decide about
-#: a wide filter takes a hundredth of a millisecond for each rule below it.
+#: Seconds after which the other questions of a call wait for the caller's next turn: to decide
+#: about a wide filter takes a hundredth of a millisecond for each rule below it.
 _ROUND: Final = 0.005
 
 _ACTIONS: Final = {
@@ -83,7 +83,7 @@ class RightsVerbs:
         began = clock()
         for question in wanted.questions:
             if clock() - began > _ROUND:
-                await asyncio.sleep(0)
+                await caller.turn()
                 began = clock()
             self._broker.counters.cost += _COST
             rights.append(self._right(identity, question))

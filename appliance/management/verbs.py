@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+#: The most bytes of an answer to a client: of some thousand routes or users.
+LONGEST_ANSWER: Final = 1024 * 1024
+
 #: Seconds that most verbs have for their answer.
 TIMEOUT: Final = 10.0
 
@@ -55,12 +58,21 @@ class Arguments:
 A = TypeVar("A", bound=Arguments)
 
 
+async def _next_iteration() -> None:
+    await asyncio.sleep(0)
+
+
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks: a client with its address, or, without an identity, the control socket."""
+    """Who asks: a client with its address, or, without an identity, the control socket.
+
+    `turn` waits until the caller may do a piece of work on the event loop, a few milliseconds. A
+    verb has one when it is run, and waits for another before each further piece.
+    """
 
     identity: Identity | None = None
     address: str = ""
+    turn: Callable[[], Awaitable[None]] = field(default=_next_iteration, compare=False, repr=False)
 
     def __str__(self) -> str:
         return "the control socket" if self.identity is None else str(self.identity)
