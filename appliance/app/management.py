@@ -25,6 +25,7 @@ from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
 from appliance.management.tokens import TokenVerbs
 from appliance.management.users import UserVerbs
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import LONGEST_ANSWER, Arguments, Caller, Verb, Verbs
 from appliance.net.callbacks import Entries
 from appliance.ops.audit import Audit
@@ -58,11 +59,12 @@ class ManagementParts:
     outcome: Reload
     reload: Callable[[], Awaitable[list[str]]]
     audit: Audit | None
+    thread: VerbThread
 
 
 def verbs(parts: ManagementParts) -> Verbs:
     """All of them."""
-    reload = parts.outcome
+    reload, thread = parts.outcome, parts.thread
 
     def directory() -> Path | None:
         return authority_directory(reload.settings.broker)
@@ -76,17 +78,18 @@ def verbs(parts: ManagementParts) -> Verbs:
     found = [
         *ApplianceVerbs(parts).verbs(),
         *ClientVerbs(parts.broker).verbs(),
-        *RightsVerbs(parts.broker, parts.access).verbs(),
-        *UserVerbs(parts.access, take_over).verbs(),
+        *RightsVerbs(parts.broker, parts.access, thread).verbs(),
+        *UserVerbs(parts.access, thread, take_over).verbs(),
         *TokenVerbs(parts.broker, parts.access).verbs(),
-        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, parts.phones).verbs(),
-        *CertificateVerbs(directory, take_over).verbs(),
+        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, parts.phones, thread).verbs(),
+        *CertificateVerbs(directory, thread, take_over).verbs(),
         # Its path changes with a restart only.
-        *RecordVerbs(reload.settings.broker.audit.path).verbs(),
+        *RecordVerbs(reload.settings.broker.audit.path, thread).verbs(),
     ]
     if reload.settings.file is not None:
         found += DoctorVerb(reload.settings.file).verbs()
-    return Verbs(found, parts.entries, parts.audit.changed if parts.audit is not None else None)
+    note = parts.audit.changed if parts.audit is not None else None
+    return Verbs(found, parts.entries, thread, note)
 
 
 class ApplianceVerbs:
@@ -104,7 +107,7 @@ class ApplianceVerbs:
         yield Verb("reload", Arguments, self._reload, RELOAD_TIMEOUT, changes="reload")
 
     async def _status(self, caller: Caller, _: Arguments) -> dict[str, object]:
-        return await self._parts.status.report()
+        return await self._parts.status.report(caller.user)
 
     async def _routes(self, caller: Caller, _: Arguments) -> list[Any]:
         bridge = self._running_bridge()

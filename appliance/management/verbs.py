@@ -12,12 +12,14 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, TypeVar
 
 import orjson
 from pydantic import ConfigDict, Field, ValidationError
 
 from appliance.broker.values import Identity
+from appliance.management.verb_thread import VerbThread
 from appliance.mqtt.codec import quote
 from appliance.net.callbacks import Entries
 from appliance.ops.control import Command, ControlError
@@ -77,6 +79,11 @@ class Caller:
     def __str__(self) -> str:
         return "the control socket" if self.identity is None else str(self.identity)
 
+    @property
+    def user(self) -> str | None:
+        """The user that asks; None for the control socket, and for clients without one."""
+        return None if self.identity is None else self.identity.username
+
     def as_json(self) -> dict[str, Any]:
         """As the audit log names it."""
         if self.identity is None:
@@ -114,10 +121,17 @@ Note = Callable[..., None]
 class Verbs:
     """All verbs by name, and how one is run."""
 
-    def __init__(self, verbs: Iterable[Verb[Any]], entries: Entries, note: Note | None) -> None:
+    def __init__(
+        self,
+        verbs: Iterable[Verb[Any]],
+        entries: Entries,
+        thread: VerbThread,
+        note: Note | None,
+    ) -> None:
         """`note` writes to the audit log; None where there is none."""
         self.by_name: dict[str, Verb[Any]] = {verb.name: verb for verb in verbs}
         self._entries = entries
+        self._thread = thread
         self._note = note
         #: The changes under way.
         self._changes: set[asyncio.Task[object]] = set()
@@ -129,7 +143,8 @@ class Verbs:
         verb = self.by_name[name]
         adapter = self._adapters.get(name)
         if adapter is None:  # it takes many milliseconds, once, and most verbs are never called
-            adapter = await asyncio.to_thread(_adapter, verb.arguments)
+            make = partial(_adapter, verb.arguments)
+            adapter = await self._thread.run(caller.user, make)
             self._adapters[name] = adapter
         arguments = _checked(adapter, given)
         if not verb.changes:
