@@ -9,6 +9,7 @@ import gc
 import logging
 import os
 import signal
+import sys
 from collections.abc import Callable, Coroutine, Sequence
 from datetime import timedelta
 from functools import partial
@@ -47,6 +48,7 @@ from appliance.host.clock import StepWatch
 from appliance.host.watch import watch
 from appliance.management.mqtt_calls import ManagementCalls
 from appliance.management.phone_certificates import PhoneCertificates
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Verbs
 from appliance.mdns import settings as mdns_settings
 from appliance.mdns.process import AnnouncerProcess
@@ -81,6 +83,10 @@ SHORTEST_TICK = 0.01
 #: which takes some 0.2 ms, and a threshold that the oldest generation never reaches.
 YOUNG_OBJECTS = 2000
 NEVER = 1 << 30
+
+#: Seconds after which a thread that computes gives the interpreter to one that waits for it: the
+#: event loop waits for that at each of its iterations. Python's own are 5 ms.
+SWITCH_INTERVAL = 0.001
 
 #: Errors that prevent the start and that a user can fix; each message says how.
 START_ERRORS = (
@@ -175,6 +181,8 @@ class App:
         )
         broker.router.reserved += (f"{settings.robot}/_appliance/",)
         self._entries = Entries(loop, broker.faults)
+        self._verb_thread = VerbThread()
+        self._stack.push_async_callback(self._verb_thread.close)
         # Its program starts with the first announcement, which is made when all listeners are open,
         # and says farewell while the other parts stop.
         self._run_in_background(self._announcer.run)
@@ -210,7 +218,7 @@ class App:
         self._tls, self._store = tls, store
         self._login, self._access = login, access
         self._enrolments = Enrolments(lambda user: access.in_force.passwords.hash_of(user))
-        self._phones = PhoneCertificates(lambda: self._reload.settings.broker)
+        self._phones = PhoneCertificates(lambda: self._reload.settings.broker, self._verb_thread)
         self._start_clock(loop)
         # Before the listeners start, and stopped after them: whatever a client is acknowledged is
         # offered to the links.
@@ -235,6 +243,7 @@ class App:
                 self.audit,
                 self._links,
                 self._enrolments,
+                self._verb_thread,
                 self._announce,
             )
         )
@@ -249,6 +258,7 @@ class App:
                 self._reload,
                 tls.warnings if tls is not None else list,
                 self._announcer,
+                self._verb_thread,
                 self._crashes.previous if self._crashes is not None else None,
             )
         )
@@ -412,6 +422,7 @@ class App:
                 self._reload,
                 self.reload,
                 self.audit,
+                self._verb_thread,
             )
         )
         self._stack.push_async_callback(self._verbs.stop)
@@ -561,6 +572,7 @@ def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until `App.run` handles it: it would end us
     _tune_garbage_collector()
+    sys.setswitchinterval(SWITCH_INTERVAL)
     notifier = Notifier.from_environment(os.environ)
     crashes = CrashReports(settings.crash_reports, settings)
     crashes.start()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import orjson
 
 from appliance.access import FileAccess
 from appliance.access.enrolments import Enrolments
@@ -22,11 +25,15 @@ from appliance.management.records import RecordVerbs
 from appliance.management.rights import RightsVerbs
 from appliance.management.tokens import TokenVerbs
 from appliance.management.users import UserVerbs
-from appliance.management.verbs import Arguments, Caller, Verb, Verbs
+from appliance.management.verb_thread import VerbThread
+from appliance.management.verbs import LONGEST_ANSWER, Arguments, Caller, Verb, Verbs
 from appliance.net.callbacks import Entries
 from appliance.ops.audit import Audit
+from appliance.ros.announcements import TURN
 from appliance.ros.bridge import Bridge
 from appliance.ros.calls.dispatcher import CallError
+from appliance.ros.status import topic_status
+from appliance.ros.topics.flow import bridged
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,11 +59,12 @@ class ManagementParts:
     outcome: Reload
     reload: Callable[[], Awaitable[list[str]]]
     audit: Audit | None
+    thread: VerbThread
 
 
 def verbs(parts: ManagementParts) -> Verbs:
     """All of them."""
-    reload = parts.outcome
+    reload, thread = parts.outcome, parts.thread
 
     def directory() -> Path | None:
         return authority_directory(reload.settings.broker)
@@ -70,17 +78,18 @@ def verbs(parts: ManagementParts) -> Verbs:
     found = [
         *ApplianceVerbs(parts).verbs(),
         *ClientVerbs(parts.broker).verbs(),
-        *RightsVerbs(parts.broker, parts.access).verbs(),
-        *UserVerbs(parts.access, take_over).verbs(),
+        *RightsVerbs(parts.broker, parts.access, thread).verbs(),
+        *UserVerbs(parts.access, thread, take_over).verbs(),
         *TokenVerbs(parts.broker, parts.access).verbs(),
-        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, parts.phones).verbs(),
-        *CertificateVerbs(directory, take_over).verbs(),
+        *EnrolmentVerb(parts.broker, parts.access, parts.enrolments, parts.phones, thread).verbs(),
+        *CertificateVerbs(directory, thread, take_over).verbs(),
         # Its path changes with a restart only.
-        *RecordVerbs(reload.settings.broker.audit.path).verbs(),
+        *RecordVerbs(reload.settings.broker.audit.path, thread).verbs(),
     ]
     if reload.settings.file is not None:
         found += DoctorVerb(reload.settings.file).verbs()
-    return Verbs(found, parts.entries, parts.audit.changed if parts.audit is not None else None)
+    note = parts.audit.changed if parts.audit is not None else None
+    return Verbs(found, parts.entries, thread, note)
 
 
 class ApplianceVerbs:
@@ -98,15 +107,16 @@ class ApplianceVerbs:
         yield Verb("reload", Arguments, self._reload, RELOAD_TIMEOUT, changes="reload")
 
     async def _status(self, caller: Caller, _: Arguments) -> dict[str, object]:
-        return await self._parts.status.report()
+        return await self._parts.status.report(caller.user)
 
-    async def _routes(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
+    async def _routes(self, caller: Caller, _: Arguments) -> list[Any]:
         bridge = self._running_bridge()
-        topics: list[dict[str, object]] = [asdict(topic) for topic in bridge.topics()]
-        return topics + [dict(entry) for entry in bridge.calls.bridged()]
+        # Which topics there are is decided now; only their entries are made later.
+        topics = (topic_status(topic, flow) for topic, flow in list(bridged(bridge.flows())))
+        return await _listed(caller, chain(topics, bridge.calls.bridged()))
 
-    async def _skipped(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
-        return [asdict(skip) for skip in self._running_bridge().skips()]
+    async def _skipped(self, caller: Caller, _: Arguments) -> list[Any]:
+        return await _listed(caller, self._running_bridge().skips())
 
     async def _upstream(self, caller: Caller, _: Arguments) -> list[dict[str, object]]:
         uplinks = self._parts.upstreams
@@ -129,3 +139,23 @@ class ApplianceVerbs:
         if bridge.problem is not None:
             raise CallError("unavailable", f"there is no bridge to ROS: {bridge.problem}")
         return bridge
+
+
+async def _listed(caller: Caller, entries: Iterable[object]) -> list[Any]:
+    """The entries as JSON values, made in several turns: a robot may have thousands.
+
+    Raises CallError as soon as they are more than a client is sent. On the control socket there is
+    no limit.
+    """
+    listed: list[Any] = []
+    size = 0
+    for entry in entries:
+        if listed and not len(listed) % TURN:
+            await caller.turn()
+        payload = orjson.dumps(entry)
+        size += len(payload) + 1
+        if size > LONGEST_ANSWER and caller.identity is not None:
+            text = f"the answer has more than {LONGEST_ANSWER} bytes, which are the most"
+            raise CallError("too_large", text)
+        listed.append(orjson.loads(payload))
+    return listed

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,10 +23,12 @@ from appliance.broker.meter import Meter
 from appliance.certs.settings import tls_files
 from appliance.config import Settings, about_size, format_duration
 from appliance.host.clock import RELEASED, is_unset
+from appliance.management.verb_thread import VerbThread
 from appliance.mdns.process import AnnouncerProcess
 from appliance.net.listeners import Listeners
 from appliance.ros.bridge import Bridge
 from appliance.ros.status import RouteStatus
+from appliance.ros.topics.flow import bridged
 from appliance.store import SessionStore
 from appliance.upstream.status import warnings_of as upstream_warnings
 
@@ -52,6 +55,7 @@ class StatusParts:
     reload: Reload
     warnings: Callable[[], list[str]]
     announcer: AnnouncerProcess
+    thread: VerbThread
     #: The crash report of the last run, if it crashed.
     crash: Path | None = None
 
@@ -88,8 +92,9 @@ class Status:
             text += f"; began after a crash, see {self._parts.crash}"
         return text
 
-    async def report(self) -> dict[str, Any]:
-        """The full state as JSON values; sizes in bytes, times in seconds."""
+    async def report(self, user: str | None) -> dict[str, Any]:
+        """The full state as JSON values, which the user asks for; sizes in bytes, times in
+        seconds."""
         parts = self._parts
         settings = parts.reload.settings
         ros, routes = self._ros(settings), self._routes()
@@ -114,7 +119,7 @@ class Status:
             "errors": self._errors(),
         }
         # In a thread: a revocation list may be long.
-        found = await asyncio.to_thread(endings, settings)
+        found = await parts.thread.run(user, partial(endings, settings))
         report["certificates"] = [
             {
                 "what": each.what,
@@ -169,10 +174,10 @@ class Status:
 
     def _ros_rates(self) -> dict[str, float]:
         """Rates of the bridge; the other metrics are those of network clients."""
-        topics = self._parts.bridge.topics() if self._parts.bridge is not None else []
+        flows = self._parts.bridge.flows() if self._parts.bridge is not None else []
         rates = {"to_mqtt": 0.0, "to_ros": 0.0}
-        for topic in topics:
-            rates[topic.direction] += topic.rate
+        for topic, flow in bridged(flows):
+            rates[topic.direction] += flow.meter.rates[0]
         return {
             "from_ros_a_second": round(rates["to_mqtt"], 1),
             "to_ros_a_second": round(rates["to_ros"], 1),

@@ -1,4 +1,4 @@
-"""The verbs about certificates of the appliance's own CA; files are read and written in threads."""
+"""The verbs about certificates of the appliance's own CA; a thread reads and writes files."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pydantic import Field
 
 from appliance import certs
 from appliance.certs import CertificateError
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Arguments, Caller, Verb
 from appliance.mqtt.codec import quote
 from appliance.ros.calls.dispatcher import CallError
@@ -55,11 +56,15 @@ class CertificateVerbs:
     """The verbs about certificates."""
 
     def __init__(
-        self, directory: Callable[[], Path | None], reload: Callable[[], Awaitable[object]]
+        self,
+        directory: Callable[[], Path | None],
+        thread: VerbThread,
+        reload: Callable[[], Awaitable[object]],
     ) -> None:
         """`directory` is that of the CA, None where it is another's; `reload` puts changed files
         in force."""
         self._directory = directory
+        self._thread = thread
         self._reload = reload
         self._lock = asyncio.Lock()
 
@@ -75,7 +80,7 @@ class CertificateVerbs:
 
     async def _list(self, caller: Caller, wanted: ListCertificates) -> dict[str, Any]:
         directory = self._own()
-        found = await self._in_thread(lambda: certs.list_certificates(directory))
+        found = await self._in_thread(caller, lambda: certs.list_certificates(directory))
         shown = [each for each in found if wanted.all or each.state in ("valid", "revoked")]
         page = shown[wanted.after : wanted.after + _MOST]
         end = wanted.after + len(page)
@@ -94,7 +99,7 @@ class CertificateVerbs:
             }
 
         async with self._lock:
-            return await self._in_thread(sign)
+            return await self._in_thread(caller, sign)
 
     async def _revoke(self, caller: Caller, wanted: Revoke) -> dict[str, Any]:
         directory, what = self._own(), wanted.certificate
@@ -113,7 +118,7 @@ class CertificateVerbs:
             return [each.name for each in certs.revoke(directory, what)]
 
         async with self._lock:
-            names = await self._in_thread(revoke)
+            names = await self._in_thread(caller, revoke)
             await self._reload()
         return {"revoked": names}
 
@@ -123,9 +128,9 @@ class CertificateVerbs:
             raise CallError("rejected", "the certificates are not of this appliance's own CA")
         return directory
 
-    async def _in_thread(self, work: Callable[[], T]) -> T:
+    async def _in_thread(self, caller: Caller, work: Callable[[], T]) -> T:
         try:
-            return await asyncio.to_thread(work)
+            return await self._thread.run(caller.user, work)
         except CertificateError as error:
             raise CallError("rejected", str(error)) from None
         except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any, Final
 
 from pydantic import Field
@@ -35,6 +36,9 @@ _ENTRY_SIZE: Final = 400
 #: Sessions that are looked through for one unit of cost, without and with a text that is searched.
 _LOOKED_PER_COST_UNIT: Final = 16
 _SEARCHED_PER_COST_UNIT: Final = 4
+
+#: Sessions that are looked through in one turn: about a millisecond.
+_LOOKED_PER_TURN: Final = 1000
 
 
 @dataclass(eq=False)
@@ -89,8 +93,7 @@ class ClientVerbs:
             one = sessions.get(wanted.client)
             found = [one] if one is not None and _matches(one, wanted, searched) else []
         else:
-            matching = (each for each in sessions.values() if _matches(each, wanted, searched))
-            found = heapq.nsmallest(wanted.limit + 1, matching, key=lambda each: each.client_id)
+            found = await self._found(caller, wanted, searched)
         most = MOST_SUBSCRIPTIONS if wanted.client is None else MOST_OF_ONE
         page: list[dict[str, Any]] = []
         size = 0
@@ -103,6 +106,21 @@ class ClientVerbs:
         # The last id is where to go on, also behind a client that leaves meanwhile.
         more = page[-1]["client"] if len(page) < len(found) else None
         return {"clients": page, "next": more}
+
+    async def _found(self, caller: Caller, wanted: ListClients, searched: str) -> list[Session]:
+        """The first ones that are wanted, one more than a page has; looked for in several turns.
+        One that ends meanwhile may still be among them."""
+        found: list[Session] = []
+        every = list(self._broker.sessions.values())
+        for begin in range(0, len(every), _LOOKED_PER_TURN):
+            if begin:
+                await caller.turn()
+            looked = every[begin : begin + _LOOKED_PER_TURN]
+            matching = (each for each in looked if _matches(each, wanted, searched))
+            found = heapq.nsmallest(
+                wanted.limit + 1, chain(found, matching), key=lambda each: each.client_id
+            )
+        return found
 
     async def _disconnect(self, caller: Caller, wanted: OneClient) -> dict[str, Any]:
         session = self._session(wanted.client)

@@ -8,9 +8,9 @@ chosen.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Final
 from urllib.parse import quote
 
@@ -27,6 +27,7 @@ from appliance.management.certificates import TIMEOUT
 from appliance.management.phone_certificates import PACKING, SIGN, PhoneCertificates
 from appliance.management.topics import topic_of
 from appliance.management.users import GroupNames, UserName
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Arguments, Caller, Verb, Verbs
 from appliance.ros.calls.dispatcher import CallError
 
@@ -71,9 +72,11 @@ class EnrolmentVerb:
         access: FileAccess,
         enrolments: Enrolments,
         phones: PhoneCertificates,
+        thread: VerbThread,
     ) -> None:
         self._broker = broker
         self._access = access
+        self._thread = thread
         self._enrolments = enrolments
         self._phones = phones
 
@@ -93,10 +96,10 @@ class EnrolmentVerb:
             raise CallError("not_found", f"there is no user {wanted.user!r}")
         check_right(self._broker, caller.identity, _verb_for(groups))
         if groups is not None:
-            await self._check_new(wanted.user, groups)
+            await self._check_new(caller, wanted.user, groups)
         if wanted.certificate:
             check_right(self._broker, caller.identity, SIGN)
-            await self._phones.check(wanted.user)
+            await self._phones.check(caller, wanted.user)
         if revocations != self._enrolments.revocations:
             raise CallError("failed", "certificates were revoked meanwhile: begin it again")
         code = self._enrolments.begin(wanted.user, groups, caller.identity, wanted.certificate)
@@ -106,10 +109,12 @@ class EnrolmentVerb:
         url = f"{wanted.origin}/#/enrol/{code}{named}"
         return {"user": wanted.user, "url": url, "seconds": round(LIFETIME), "qr": _picture(url)}
 
-    async def _check_new(self, user: str, groups: tuple[str, ...]) -> None:
+    async def _check_new(self, caller: Caller, user: str, groups: tuple[str, ...]) -> None:
         """Raise CallError for what the phone would be refused: its owner could not mend that."""
         acl = self._access.in_force.acl_path
-        known = [] if acl is None else await asyncio.to_thread(acl_groups.groups, acl)
+        known: list[str] = []
+        if acl is not None:
+            known = await self._thread.run(caller.user, partial(acl_groups.groups, acl))
         unknown = [name for name in groups if name not in known]
         if unknown:
             raise CallError("bad_request", f"there is no group {unknown[0]!r}")

@@ -2,6 +2,9 @@
 
 A call is made and answered as one of a ROS service, see `ros/calls/dispatcher.py`, which needs no
 ROS for it. The access rules decide who may write a verb's topic; without a rule nobody may.
+
+However many calls come at once, one of them works in an iteration of the event loop, and users take
+turns. Calls of ROS, and so what cancels a goal, have a dispatcher and a queue of their own.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.output import Output
 from appliance.broker.session import Session
 from appliance.management.topics import topic_of
-from appliance.management.verbs import Caller, Verbs
+from appliance.management.verbs import LONGEST_ANSWER, Caller, Verbs
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.dispatcher import (
     Answer,
@@ -34,9 +37,6 @@ CLIENT_ID: Final = "_control"
 
 #: The most bytes of a call.
 LONGEST: Final = 64 * 1024
-
-#: The most bytes of an answer: of some thousand routes or users.
-LONGEST_ANSWER: Final = 1024 * 1024
 
 #: The most work that the values of a call may be (`ros/payload/cost.py`), a millisecond: everybody
 #: waits while they are checked. 200 questions about rights are half of it.
@@ -92,11 +92,13 @@ class ManagementCalls:
 
     def _handle(self, name: str, call: Call) -> Callable[[], Awaitable[Answer]]:
         self._broker.counters.cost += COST
-        caller = _caller(call.caller)
+        caller = self._caller(call.caller)
         given = _decoded(call)
 
         async def answer() -> Answer:
+            await caller.turn()
             result = await self._verbs.run(caller, name, given)
+            await caller.turn()
             payload = VALUE_ENCODINGS[call.encoding].dumps(result)
             if len(payload) > LONGEST_ANSWER:
                 text = f"the answer has {len(payload)} bytes, {LONGEST_ANSWER} at most are sent"
@@ -105,14 +107,13 @@ class ManagementCalls:
 
         return answer
 
-
-def _caller(session: Session) -> Caller:
-    if session.identity is None:
-        # A part of the appliance publishes what a client has asked it to, such as an answer.
-        raise CallError("not_authorized", "only clients manage the appliance")
-    link = session.link
-    address = link.transport.address if isinstance(link, Output) else ""
-    return Caller(session.identity, address)
+    def _caller(self, session: Session) -> Caller:
+        if session.identity is None:
+            # A part of the appliance publishes what a client has asked it to, such as an answer.
+            raise CallError("not_authorized", "only clients manage the appliance")
+        link = session.link
+        address = link.transport.address if isinstance(link, Output) else ""
+        return Caller(session.identity, address, partial(self._dispatcher.turn, session))
 
 
 def _decoded(call: Call) -> Any:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ from appliance.certs import CertificateError, packing
 from appliance.certs.settings import authority_directory
 from appliance.config import BrokerSection
 from appliance.management.child import Child
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Caller, Verbs
 from appliance.mqtt.codec import quote
 from appliance.ros.calls.dispatcher import CallError
@@ -36,16 +38,18 @@ _NICE: Final = 5
 class PhoneCertificates:
     """Makes them, one at a time. What is wrong is told to phones: without this computer's paths."""
 
-    def __init__(self, broker: Callable[[], BrokerSection]) -> None:
+    def __init__(self, broker: Callable[[], BrokerSection], thread: VerbThread) -> None:
         """`broker` is the section of the configuration that is in force."""
         self._broker = broker
+        self._thread = thread
         self._lock = asyncio.Lock()
 
-    async def check(self, name: str) -> None:
+    async def check(self, caller: Caller, name: str) -> None:
         """Raise CallError where `make` would be refused: a phone's owner could not mend that."""
         directory = self._directory()
         try:
-            await asyncio.to_thread(certs.check_new_client, directory, name)
+            check = partial(certs.check_new_client, directory, name)
+            await self._thread.run(caller.user, check)
         except CertificateError as error:
             raise CallError("rejected", _without(directory, str(error))) from None
         except OSError as error:
@@ -53,7 +57,7 @@ class PhoneCertificates:
 
     async def make(self, verbs: Verbs, caller: Caller, name: str, password: str) -> bytes:
         """The file of a new key, which the password opens. Raises CallError."""
-        await self.check(name)
+        await self.check(caller, name)
         directory = self._directory()
         key, request = certs.new_request(name)
         try:

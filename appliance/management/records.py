@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Arguments, Caller, Verb
 from appliance.ops import logs
 from appliance.ros.calls.dispatcher import CallError
@@ -35,9 +36,10 @@ class Tail(Arguments):
 class RecordVerbs:
     """The verbs about the log and the audit log."""
 
-    def __init__(self, audit: Path | None) -> None:
+    def __init__(self, audit: Path | None, thread: VerbThread) -> None:
         """`audit` is the path of the audit log; None where there is none."""
         self._audit = audit
+        self._thread = thread
 
     def verbs(self) -> Iterator[Verb[Any]]:
         """All of them."""
@@ -53,10 +55,10 @@ class RecordVerbs:
         if path is None:
             raise CallError("rejected", "there is no audit log: broker.audit.path names none")
         try:
-            lines = await asyncio.to_thread(_tail, path)
+            entries = await self._thread.run(caller.user, partial(_tail, path, wanted.lines))
         except OSError as error:
             raise CallError("failed", f"the audit log cannot be read: {error.strerror}") from None
-        return {"entries": await asyncio.to_thread(_entries, lines, wanted.lines)}
+        return {"entries": entries}
 
 
 def newest(lines: list[str], most: int) -> list[str]:
@@ -72,14 +74,14 @@ def newest(lines: list[str], most: int) -> list[str]:
     return found
 
 
-def _tail(path: Path) -> list[str]:
-    """The whole lines in the last bytes of the file."""
+def _tail(path: Path, most: int) -> list[Any]:
+    """The last entries of the file: of the whole lines in its last bytes."""
     with path.open("rb") as file:
         start = max(0, os.fstat(file.fileno()).st_size - LONGEST)
         file.seek(start)
         data = file.read(LONGEST)
     lines = data.decode(errors="replace").split("\n")
-    return [line for line in lines[bool(start) :] if line]
+    return _entries([line for line in lines[bool(start) :] if line], most)
 
 
 def _entries(lines: list[str], most: int) -> list[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
@@ -12,6 +13,7 @@ from pydantic import Field
 from appliance.access import ActionVerdict, FileAccess
 from appliance.broker.broker import Broker
 from appliance.broker.values import Action, Decision, Identity
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Arguments, Caller, Name, Verb
 from appliance.mqtt.codec import quote
 from appliance.mqtt.topics import check_filter, check_topic, parse_shared
@@ -26,8 +28,8 @@ _MOST_PASSED: Final = 100
 #: The cost of a decision about a topic that was not asked about before.
 _COST: Final = 10
 
-#: Seconds after which the other questions of a call wait for the loop's next round: to decide about
-#: a wide filter takes a hundredth of a millisecond for each rule below it.
+#: Seconds after which the other questions of a call wait for the caller's next turn: to decide
+#: about a wide filter takes a hundredth of a millisecond for each rule below it.
 _ROUND: Final = 0.005
 
 _ACTIONS: Final = {
@@ -65,9 +67,10 @@ class Explain(Arguments):
 class RightsVerbs:
     """The verbs about rights; on the event loop, as the rules are."""
 
-    def __init__(self, broker: Broker, access: FileAccess) -> None:
+    def __init__(self, broker: Broker, access: FileAccess, thread: VerbThread) -> None:
         self._broker = broker
         self._access = access
+        self._thread = thread
 
     def verbs(self) -> Iterator[Verb[Any]]:
         """All of them."""
@@ -83,7 +86,7 @@ class RightsVerbs:
         began = clock()
         for question in wanted.questions:
             if clock() - began > _ROUND:
-                await asyncio.sleep(0)
+                await caller.turn()
                 began = clock()
             self._broker.counters.cost += _COST
             rights.append(self._right(identity, question))
@@ -134,7 +137,8 @@ class RightsVerbs:
             raise CallError("rejected", "there is no ACL file")
         try:
             # In a thread: it names all rules that do not apply, and there may be 100,000.
-            explanation = await asyncio.to_thread(acl.explain, identity, wanted.topic)
+            explain = partial(acl.explain, identity, wanted.topic)
+            explanation = await self._thread.run(caller.user, explain)
         except ValueError as error:
             raise CallError("bad_request", f"{quote(wanted.topic[:200])}: {error}") from None
         verdicts = [

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from appliance.access import AccessFileError, FileAccess, Passwords
 from appliance.access import groups as acl_groups
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Arguments, Caller, Verb
 from appliance.ros.calls.dispatcher import CallError
 
@@ -63,11 +64,17 @@ class UserGroups(OneUser):
 
 
 class UserVerbs:
-    """The verbs about users. Files are read and written in threads."""
+    """The verbs about users. Files are read and written in a thread."""
 
-    def __init__(self, access: FileAccess, reload: Callable[[], Awaitable[object]]) -> None:
+    def __init__(
+        self,
+        access: FileAccess,
+        thread: VerbThread,
+        reload: Callable[[], Awaitable[object]],
+    ) -> None:
         """`reload` puts changed files in force."""
         self._access = access
+        self._thread = thread
         self._reload = reload
         self._lock = asyncio.Lock()
 
@@ -92,7 +99,7 @@ class UserVerbs:
             ]
             return {"users": entries, "groups": acl_groups.groups(acl) if acl is not None else []}
 
-        return await _in_thread(read)
+        return await self._in_thread(caller, read)
 
     async def _add(self, caller: Caller, wanted: NewUser) -> dict[str, Any]:
         def add(users: Passwords) -> None:
@@ -102,14 +109,14 @@ class UserVerbs:
             # Before the user can log in: what an earlier one of this name was in is not its own.
             self._write_groups(wanted.user, wanted.groups)
 
-        return await self._change(wanted.user, add)
+        return await self._change(caller, wanted.user, add)
 
     async def _set(self, caller: Caller, wanted: UserPassword) -> dict[str, Any]:
         def set_password(users: Passwords) -> None:
             _known(users, wanted.user)
             users.set(wanted.user, wanted.password, wanted.scram)
 
-        return await self._change(wanted.user, set_password)
+        return await self._change(caller, wanted.user, set_password)
 
     async def _remove(self, caller: Caller, wanted: OneUser) -> dict[str, Any]:
         def remove(users: Passwords) -> None:
@@ -118,14 +125,14 @@ class UserVerbs:
             # A client's certificate may still name the user, or a new one may have its name.
             self._write_groups(wanted.user, [])
 
-        return await self._change(wanted.user, remove)
+        return await self._change(caller, wanted.user, remove)
 
     async def _join(self, caller: Caller, wanted: UserGroups) -> dict[str, Any]:
         def join(users: Passwords) -> None:
             _known(users, wanted.user)
             self._write_groups(wanted.user, wanted.groups)
 
-        return await self._change(wanted.user, join)
+        return await self._change(caller, wanted.user, join)
 
     def _write_groups(self, user: str, wanted: list[str]) -> None:
         rules = self._access.in_force
@@ -138,7 +145,9 @@ class UserVerbs:
         else:
             acl_groups.leave(rules.acl_path, rules.robot, user)
 
-    async def _change(self, user: str, change: Callable[[Passwords], None]) -> dict[str, Any]:
+    async def _change(
+        self, caller: Caller, user: str, change: Callable[[Passwords], None]
+    ) -> dict[str, Any]:
         path = self._access.in_force.users_path
 
         def run() -> None:
@@ -147,19 +156,18 @@ class UserVerbs:
             users.save()
 
         async with self._lock:
-            await _in_thread(run)
+            await self._in_thread(caller, run)
             await self._reload()
         return {"user": user}
 
-
-async def _in_thread(work: Callable[[], T]) -> T:
-    """The result of the work; what is wrong with a file or an argument is a CallError."""
-    try:
-        return await asyncio.to_thread(work)
-    except AccessFileError as error:
-        raise CallError("failed", str(error)) from None
-    except ValueError as error:
-        raise CallError("bad_request", str(error)) from None
+    async def _in_thread(self, caller: Caller, work: Callable[[], T]) -> T:
+        """The result of the work; what is wrong with a file or an argument is a CallError."""
+        try:
+            return await self._thread.run(caller.user, work)
+        except AccessFileError as error:
+            raise CallError("failed", str(error)) from None
+        except ValueError as error:
+            raise CallError("bad_request", str(error)) from None
 
 
 def _there(path: Path | None) -> Path:

@@ -12,12 +12,14 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, TypeVar
 
 import orjson
 from pydantic import ConfigDict, Field, ValidationError
 
 from appliance.broker.values import Identity
+from appliance.management.verb_thread import VerbThread
 from appliance.mqtt.codec import quote
 from appliance.net.callbacks import Entries
 from appliance.ops.control import Command, ControlError
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 log = logging.getLogger(__name__)
+
+#: The most bytes of an answer to a client: of some thousand routes or users.
+LONGEST_ANSWER: Final = 1024 * 1024
 
 #: Seconds that most verbs have for their answer.
 TIMEOUT: Final = 10.0
@@ -55,15 +60,29 @@ class Arguments:
 A = TypeVar("A", bound=Arguments)
 
 
+async def _next_iteration() -> None:
+    await asyncio.sleep(0)
+
+
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks: a client with its address, or, without an identity, the control socket."""
+    """Who asks: a client with its address, or, without an identity, the control socket.
+
+    `turn` waits until the caller may do a piece of work on the event loop, a few milliseconds. A
+    verb has one when it is run, and waits for another before each further piece.
+    """
 
     identity: Identity | None = None
     address: str = ""
+    turn: Callable[[], Awaitable[None]] = field(default=_next_iteration, compare=False, repr=False)
 
     def __str__(self) -> str:
         return "the control socket" if self.identity is None else str(self.identity)
+
+    @property
+    def user(self) -> str | None:
+        """The user that asks; None for the control socket, and for clients without one."""
+        return None if self.identity is None else self.identity.username
 
     def as_json(self) -> dict[str, Any]:
         """As the audit log names it."""
@@ -102,10 +121,17 @@ Note = Callable[..., None]
 class Verbs:
     """All verbs by name, and how one is run."""
 
-    def __init__(self, verbs: Iterable[Verb[Any]], entries: Entries, note: Note | None) -> None:
+    def __init__(
+        self,
+        verbs: Iterable[Verb[Any]],
+        entries: Entries,
+        thread: VerbThread,
+        note: Note | None,
+    ) -> None:
         """`note` writes to the audit log; None where there is none."""
         self.by_name: dict[str, Verb[Any]] = {verb.name: verb for verb in verbs}
         self._entries = entries
+        self._thread = thread
         self._note = note
         #: The changes under way.
         self._changes: set[asyncio.Task[object]] = set()
@@ -117,7 +143,8 @@ class Verbs:
         verb = self.by_name[name]
         adapter = self._adapters.get(name)
         if adapter is None:  # it takes many milliseconds, once, and most verbs are never called
-            adapter = await asyncio.to_thread(_adapter, verb.arguments)
+            make = partial(_adapter, verb.arguments)
+            adapter = await self._thread.run(caller.user, make)
             self._adapters[name] = adapter
         arguments = _checked(adapter, given)
         if not verb.changes:

@@ -130,12 +130,14 @@ def test_a_route_is_shown_with_its_topic(names: list[str], template: str, shown:
 
 
 def test_what_ros_routes_carry_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    topics = [
-        SimpleNamespace(direction="to_mqtt", rate=10.0),
-        SimpleNamespace(direction="to_mqtt", rate=2.5),
-        SimpleNamespace(direction="to_ros", rate=20.0),
+    flows = [
+        SimpleNamespace(
+            bridged=SimpleNamespace(direction=direction), meter=SimpleNamespace(rates=[rate, 0.0])
+        )
+        for direction, rate in (("to_mqtt", 10.0), ("to_mqtt", 2.5), ("to_ros", 20.0))
     ]
-    bridge = SimpleNamespace(topics=lambda: topics)
+    flows.append(SimpleNamespace(bridged=None))  # there is no such topic now
+    bridge = SimpleNamespace(flows=lambda: flows)
     asked = SimpleNamespace(_parts=SimpleNamespace(bridge=bridge))
     rates = Status._ros_rates(asked)  # type: ignore[arg-type]
     assert rates == {"from_ros_a_second": 12.5, "to_ros_a_second": 20.0}

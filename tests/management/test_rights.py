@@ -11,13 +11,14 @@ import pytest
 
 from appliance.broker.values import Identity
 from appliance.management.rights import Question, Questions, RightsVerbs
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import Caller
 
 
 async def test_the_loop_goes_on_between_questions_that_take_long(monkeypatch: pytest.MonkeyPatch):
     """As those about wide filters, with thousands of rules."""
     broker: Any = SimpleNamespace(counters=SimpleNamespace(cost=0))
-    verbs = RightsVerbs(broker, cast(Any, None))
+    verbs = RightsVerbs(broker, cast(Any, None), VerbThread())
     monkeypatch.setattr(verbs, "_right", lambda *question: time.sleep(0.006))
     rounds = 0
 

@@ -9,6 +9,7 @@ import pytest
 from waiting import until
 
 from appliance.broker.faults import Faults
+from appliance.management.verb_thread import VerbThread
 from appliance.management.verbs import LOCAL, Arguments, Caller, Verb, Verbs
 from appliance.net.callbacks import Entries
 from appliance.ros.calls.dispatcher import CallError
@@ -24,6 +25,7 @@ class Change:
         self.verbs = Verbs(
             [Verb("change", Arguments, self._run, changes="changed")],
             Entries(asyncio.get_running_loop(), Faults()),
+            VerbThread(),
             lambda what, **details: self.noted.append(what),
         )
 

@@ -51,7 +51,7 @@ from appliance.ros.payload.encodings.registry import (
     named_encoding,
 )
 from appliance.ros.payload.payloads import InputLimits
-from appliance.ros.topics.conversions import ConversionQueue, user_of
+from appliance.ros.topics.conversions import LITTLE, ConversionQueue, user_of
 from appliance.ros.topics.staleness import SENT_AT, stated_age
 
 log = logging.getLogger(__name__)
@@ -491,6 +491,11 @@ class CallDispatcher:
 
         self.conversions.do(caller, size, settle)
         return await done
+
+    async def turn(self, caller: Session) -> None:
+        """Wait until it is the caller's turn for a piece of other work. As of conversions, there is
+        one piece per iteration of the event loop, and users take turns."""
+        await self.convert(caller, LITTLE + 1, lambda: None)
 
     def _reply_for(self, caller: Session, message: Message, own: str, token: str) -> Message:
         """An empty answer with its topic and Correlation Data. Raises CallError."""
