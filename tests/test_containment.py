@@ -972,6 +972,7 @@ ELSEWHERE = {
     **dict.fromkeys(test_dial.ENTRIES, "upstream/test_dial.py"),
     "upstream.return": "upstream/test_servers.py",
     "upstream.start": "upstream/test_reload_links.py",
+    "reload.close": "app/test_inside.py",
     "stop.session": "test_containment.py",
     "store.read": "store/test_memory_backlogs.py",
 }
