@@ -55,29 +55,24 @@ def test_what_has_a_ring(visit: Callable[..., Visit], appliance: ApplianceProces
 
 def test_who_drives_with_what(visit: Callable[..., Visit]) -> None:
     """It is oneself, with a mouse, and nothing was refused: what each stream begins with is not."""
-    for _ in range(3):  # on a busy computer a command may be late, which is refused rightly
-        visited = visit(**DESKTOP)
-        page = visited.sign_in(page="Drive")
-        page.wait_for_selector("dd:text-is('ready')")
-        page.hover(".pad", position={"x": 200, "y": 20})
-        page.mouse.down()
-        page.wait_for_selector("strong bdi:text-is('you')")
-        by_mouse = page.inner_text(".hint")
-        page.mouse.up()
-        page.wait_for_selector(".hint:text-is('Hold to drive')")
-        page.keyboard.down("ArrowUp")
-        page.wait_for_selector("strong bdi:text-is('you')")
-        by_keys = page.inner_text(".hint")
-        page.keyboard.up("ArrowUp")
-        refused = page.inner_text("dt:text-is('Refused') + dd")
-        if refused == "0":
-            break
-        visited.close()
-    assert (by_mouse, by_keys, refused) == ("Driving by mouse", "Driving by keys", "0")
+    visited = visit(**DESKTOP)
+    page = visited.sign_in(page="Drive")
+    page.wait_for_selector("dd:text-is('ready')")
+    page.hover(".pad", position={"x": 200, "y": 20})
     page.mouse.down()
     page.wait_for_selector("strong bdi:text-is('you')")
+    assert page.inner_text(".hint") == "Driving by mouse"
+    assert page.inner_text("dt:text-is('Refused') + dd") == "0", page.inner_text("main")
+    # axe holds the page up. On a busy computer that is long enough for the page to stop the robot,
+    # and for a command to be late, which is refused rightly.
     visited.look("desktop-driving-by-mouse")
     page.mouse.up()
+    refused = page.inner_text("dt:text-is('Refused') + dd")
+    page.keyboard.down("ArrowUp")
+    page.wait_for_selector(".hint:text-is('Driving by keys')")
+    page.wait_for_selector("strong bdi:text-is('you')")
+    page.keyboard.up("ArrowUp")
+    assert page.inner_text("dt:text-is('Refused') + dd") == refused, page.inner_text("main")
 
 
 def test_no_audit_log(visit: Callable[..., Visit]) -> None:
