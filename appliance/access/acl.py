@@ -206,7 +206,7 @@ class _Denials:
         # The first rule that denies a topic which begins as those so far, of any greater length.
         lasting = nobody if self._everything is None else self._everything
         reached = [self._root]
-        passed = 1
+        passed = 1 + 2 * len(shared)
         may_be_wild = not shared or shared[0][:1] != "$"  # [MQTT-4.7.2-1]
         for name in shared:
             above, reached = reached, []
@@ -444,7 +444,7 @@ class Acl:
                 denials.add(applied)
             elif not rule.gives(needed):
                 passed.append((rule, _ONLY[rule.permission]))
-            elif applied.filter is None or not applied.overlaps(wanted):
+            elif applied.filter is None or not _overlap(applied.filter, wanted, work):
                 passed.append((rule, applied.why_passed(wanted, "shares no topic with the filter")))
             else:
                 work.rules += 1
@@ -513,6 +513,12 @@ def _substitute(filter: str, identity: Identity) -> str | None:
 
 def _has_wildcard(name: str) -> bool:
     return "+" in name or "#" in name
+
+
+def _overlap(a: str, b: str, work: _Work) -> bool:
+    """Whether two filters share a topic."""
+    work.levels += min(a.count("/"), b.count("/")) + 1
+    return overlaps(a, b)
 
 
 def _changes_levels(name: str) -> bool:

@@ -243,7 +243,6 @@ class App:
                 self.audit,
                 self._links,
                 self._enrolments,
-                self._verb_thread,
                 self._announce,
             )
         )

@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Final, cast
 
@@ -24,7 +23,6 @@ from appliance.broker.session import Session
 from appliance.certs import CertificateError, LoadedTls, TlsContexts
 from appliance.certs.settings import tls_files, tls_policies
 from appliance.config import ConfigError, Settings
-from appliance.management.verb_thread import VerbThread
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.listeners import Admission, Listeners
 from appliance.ops import logs
@@ -75,7 +73,6 @@ class ReloadParts:
     audit: Audit | None
     links: Links
     enrolments: Enrolments
-    thread: VerbThread
     #: Announces on the network what is in force now.
     announce: Callable[[], None]
 
@@ -161,14 +158,14 @@ class Reload:
         async with self._lock:
             tls = self._parts.tls
             if tls is not None:
-                self._take_certificates(tls, await self._parts.thread.run(None, tls.prepare))
+                self._take_certificates(tls, await asyncio.to_thread(tls.prepare))
                 self._parts.announce()
 
     async def _run(self) -> list[str]:
         parts = self._parts
         try:
             # In a thread: long files take time, and logins must not wait for that.
-            read = await parts.thread.run(None, partial(_read, parts))
+            read = await asyncio.to_thread(_read, parts)
         except (ConfigError, AccessFileError, CertificateError) as error:
             raise ReloadError(str(error)) from None
         before, settings = parts.settings, read.settings

@@ -19,9 +19,10 @@ MAXIMUM_CHECKED = 128
 #: Members of a list of ranks that take as long as looking at one.
 LISTED_PER_CHECK = 8
 
-#: Answers that a member may not receive a topic while messages are passed on, after which no more
-#: members are asked about one whose next member may not.
+#: Answers that a member may not receive a topic while messages are passed on, after which only
+#: FEW_CHECKED members are asked about each message; the next one begins behind these.
 MAXIMUM_FORBIDDEN = 4096
+FEW_CHECKED = 32
 
 
 def as_target(session: Session, subscription: Subscription) -> Target:
@@ -176,6 +177,7 @@ class Heirs:
     ) -> int:
         """The index of the member that gets the message; -1 when no member can take it."""
         forbidden = self._forbidden.setdefault(message.topic, set())
+        table_of = self._ranks[0], self._ranks.setdefault(size, {})
         passed_over = 0
         begin = share._next % (len(ranks) or 1)
         for rank in (3, 2, 1) if self._absent_too else (3, 2):
@@ -184,22 +186,30 @@ class Heirs:
                 while (index := ranks.find(rank, index + 1, end)) >= 0:
                     session = group.sessions[index]
                     qos = 0 if session in group.of_qos_0 else 1
+                    known = table_of[qos]
+                    rank_known = known.get(session, rank)
+                    if rank_known < rank:  # as it turned out in another group
+                        ranks[index] = rank_known
+                        continue
                     if session not in forbidden:
                         self.checked += 1
                         rank_now = _rank(session, qos)
                         if rank_now >= rank and qos and not session.has_room(message):
                             rank_now = 0
                         if rank_now < rank:
-                            self._ranks[size if qos else 0][session] = ranks[index] = rank_now
+                            known[session] = ranks[index] = rank_now
                             continue
                         if may_receive(session, message.topic):
+                            self.checked += passed_over // LISTED_PER_CHECK
                             return index
                         forbidden.add(session)
                         self._forbidden_count += 1
-                        if self._forbidden_count > MAXIMUM_FORBIDDEN:
-                            return -1
                     passed_over += 1
-                    if passed_over >= MAXIMUM_CHECKED:
+                    few = self._forbidden_count > MAXIMUM_FORBIDDEN
+                    if passed_over >= (FEW_CHECKED if few else MAXIMUM_CHECKED):
+                        if few:
+                            share._next = (index + 1) % len(ranks)
+                        self.checked += passed_over // LISTED_PER_CHECK
                         return -1
         self.checked += passed_over // LISTED_PER_CHECK
         return -1

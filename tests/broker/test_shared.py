@@ -514,3 +514,32 @@ def test_what_many_groups_leave_is_neither_lost_nor_doubled_nor_reordered(
         for number in range(groups):
             texts = [each.payload for each in came if each.topic == f"a/{number}"]
             assert texts == sorted(texts)
+
+
+@pytest.mark.patches
+@pytest.mark.parametrize("forbidden", [1, 31, 60])
+def test_each_message_finds_one_who_may_read_it_however_many_may_not(
+    monkeypatch: pytest.MonkeyPatch, join: Join, access: FakeAccess, forbidden: int
+) -> None:
+    """Also when so many answers were no that only a few members are asked about each message."""
+    monkeypatch.setattr(shared, "MAXIMUM_FORBIDDEN", 20)
+    topics = [f"a/{number}" for number in range(40)]
+    leaving = join("leaving", **lasting(5))
+    leaving.subscribe("$share/g/a/+", 1)
+    publisher = join("publisher")
+    for topic in topics:
+        assert publisher.publish(topic, b"", 1) == 0
+    for index in range(forbidden):
+        member = join(f"m{index}", user=f"m{index}", **lasting(5))
+        for topic in topics:
+            access.deny(f"m{index}", Action.RECEIVE, topic)
+        member.subscribe("$share/g/a/+", 1)
+    readers = [join(f"r{index}", **lasting(5)) for index in range(4)]
+    for reader in readers:
+        reader.subscribe("$share/g/a/+", 1)
+    leaving.lose()
+    came = Counter(each.topic for reader in readers for each in reader.drain())
+    if forbidden < shared.FEW_CHECKED:
+        assert came == Counter(topics)
+    else:  # of a crowd not all are asked, and those who were are passed by the next message
+        assert came.keys() <= set(topics) and set(came.values()) == {1} and len(came) > 20

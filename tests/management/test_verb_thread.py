@@ -1,4 +1,4 @@
-"""What verbs and a reload compute: in one thread, users in turn."""
+"""What verbs compute: in one thread, users in turn."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance import config
 from appliance.access import Acl, Passwords
@@ -21,6 +21,7 @@ from appliance.app import status as status_module
 from appliance.app.main import App
 from appliance.management import records
 from appliance.management.verb_thread import VerbThread
+from appliance.ros.calls.dispatcher import CallError
 from management.managed import Site
 
 
@@ -31,7 +32,7 @@ async def thread() -> AsyncIterator[VerbThread]:
     await thread.close()
 
 
-async def test_verbs_and_reloads_compute_in_one_thread(site: Site, monkeypatch: pytest.MonkeyPatch):
+async def test_verbs_compute_in_one_thread(site: Site, monkeypatch: pytest.MonkeyPatch):
     """And no two at once: each takes the interpreter's lock from the event loop."""
     computed: dict[str, set[int]] = {}
 
@@ -57,9 +58,45 @@ async def test_verbs_and_reloads_compute_in_one_thread(site: Site, monkeypatch: 
     await admin.call("audit")
     await admin.call("status")
     await admin.call("reload")
-    assert len(computed) == 6
+    others = computed.pop("_read")
+    assert len(computed) == 5
     (number,) = set.union(*computed.values())
     assert number != threading.get_native_id()
+    assert number not in others
+
+
+async def test_a_reload_waits_for_no_verb(site: Site, monkeypatch: pytest.MonkeyPatch):
+    """Such as one that waits for a lock of a file: it is a reload that takes rights away."""
+    go_on, begun = threading.Event(), threading.Event()
+
+    def wait(*given: Any) -> dict[str, Any]:
+        begun.set()
+        go_on.wait(PATIENCE)
+        return {}
+
+    monkeypatch.setattr(acl_groups, "members", wait)
+    admin = await site.join("a")
+    hung = asyncio.create_task(admin.call("users"))
+    await until(begun.is_set, "the verb to hang")
+    try:
+        await site.app.reload()
+    finally:
+        go_on.set()
+    await hung
+
+
+async def test_what_waits_at_the_end_is_told(thread: VerbThread):
+    go_on = threading.Event()
+    first = asyncio.create_task(thread.run("a", lambda: go_on.wait(PATIENCE)))
+    second = asyncio.create_task(thread.run("b", lambda: None))
+    await asyncio.sleep(0)
+    closing = asyncio.create_task(thread.close())
+    await asyncio.sleep(0)
+    go_on.set()
+    await closing
+    assert await first
+    with pytest.raises(CallError, match="the appliance stops"):
+        await second
 
 
 async def test_it_ends_with_the_appliance(tmp_path: Path):
