@@ -144,11 +144,6 @@ class _Applied:
             return self.rule.denies
         return matches(self.filter, topic)
 
-    def overlaps(self, filter: str) -> bool:
-        if self.filter is None:
-            return self.rule.denies
-        return overlaps(self.filter, filter)
-
     def why_passed(self, filter: str, otherwise: str) -> str:
         """Why the rule does not apply: the name only where another one could make it match."""
         if self.filter is not None:

@@ -69,8 +69,8 @@ class _File:
         headers = (("Vary", "Accept-Encoding"), *caching)
         if takes_gzip(request.get("accept-encoding") or ""):
             headers = (("Content-Encoding", "gzip"), *headers)
-            return HttpResponse(200, self.compressed, self.content_type, headers, True)
-        return HttpResponse(200, self.content, self.content_type, headers, True)
+            return HttpResponse(200, self.compressed, self.content_type, headers, is_shared=True)
+        return HttpResponse(200, self.content, self.content_type, headers, is_shared=True)
 
 
 class Console:

@@ -113,12 +113,18 @@ def _threads() -> list[threading.Thread]:
     return [each for each in threading.enumerate() if each.name.startswith("verbs")]
 
 
-async def test_users_take_turns(thread: VerbThread):
-    """The work of one, however much it is, does not keep another's waiting."""
-    done: list[str] = []
+async def _held(thread: VerbThread) -> tuple[threading.Event, asyncio.Task[bool]]:
+    """A work of user "a" that has begun, and what lets it go on."""
     go_on = threading.Event()
     held = asyncio.create_task(thread.run("a", go_on.wait))
     await asyncio.sleep(0)
+    return go_on, held
+
+
+async def test_users_take_turns(thread: VerbThread):
+    """The work of one, however much it is, does not keep another's waiting."""
+    done: list[str] = []
+    go_on, held = await _held(thread)
     works = [
         asyncio.create_task(thread.run(user, lambda user=user: done.append(user)))  # type: ignore[misc]
         for user in ("a", "a", "a", "b", "c", "a", "b")
@@ -132,9 +138,7 @@ async def test_users_take_turns(thread: VerbThread):
 async def test_work_whose_call_has_ended_is_left_out(thread: VerbThread):
     """One that has begun goes on, and the next one follows it."""
     done: list[int] = []
-    go_on = threading.Event()
-    held = asyncio.create_task(thread.run("a", go_on.wait))
-    await asyncio.sleep(0)
+    go_on, held = await _held(thread)
     works = [
         asyncio.create_task(thread.run("a", lambda n=n: done.append(n)))  # type: ignore[misc]
         for n in range(4)
