@@ -484,7 +484,6 @@ class HttpLayer(MiddleLayer):
         http.receive_data(body)
         while type(http.next_event()) is h11.Data:
             pass
-        self._limit(self._timeout)
         return body
 
     def _take_body(self) -> None:
@@ -500,6 +499,7 @@ class HttpLayer(MiddleLayer):
     def _hand_over_body(self) -> None:
         """Count what reading the body costs, before that is done: it ends the round for others."""
         self._scheduler.count_cost(self._length // READ_PER_COST_UNIT, self._payer)
+        self._limit(self._timeout)  # also against a limit that ends in this very iteration
         self._end_body(None)
 
     def _end_body(self, error: HttpError | None) -> None:
