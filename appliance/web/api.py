@@ -83,6 +83,9 @@ _CALL_STATUS: Final = {
     "timeout": 504,
 }
 
+#: What is wrong with a body, in the words of calls; others are `bad_request`.
+_BODY_ERRORS: Final = {408: "timeout", 413: "too_large", 503: "unavailable"}
+
 #: Both ends of a new connection: `Listeners.carry`.
 Carry: TypeAlias = Callable[
     [str, str, "ssl.SSLObject | None", Terms], "tuple[socket.socket, UpperLayer] | None"
@@ -198,6 +201,8 @@ class Api:
             return _error(504, "timeout", f"not done within {LONGEST_ANSWER:g} s")
         except RefusedError as error:
             return _refused(error)
+        except HttpError as error:
+            return _error(error.status, _BODY_ERRORS.get(error.status, "bad_request"), str(error))
         except EOFError:
             return _error(503, "busy", "the connection has ended")
 

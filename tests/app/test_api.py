@@ -275,8 +275,9 @@ BAD: dict[str, tuple[object, int]] = {
 async def test_bad_bodies(web: WebApp):
     messages = listen(web)
     for name, (body, expected) in BAD.items():
-        status, headers, words = await post(web, "publish", body)
-        assert status == expected and words, name
+        status, headers, error = await post(web, "publish", body)
+        assert status == expected and error["error"]["message"], name
+        assert error["error"]["code"] == ("too_large" if status == 413 else "bad_request"), name
         assert (headers.get("connection") == "close") is (status == 413), name
     assert not messages
     assert (await post(web, "publish", GOOD))[0] == 200
