@@ -467,7 +467,11 @@ def test_a_node_comes_and_goes(client_of, appliance):
 
     def change():
         client.until(value, False)
-        assert client.call(f"{value}/set", True)["successful"]
+        answer = client.call(f"{value}/set", True)
+        if answer.get("error", {}).get("code") == "timeout":
+            # A node that has not discovered within 100 ms who asks it drops its answer (Fast DDS).
+            answer = client.call(f"{value}/set", True)
+        assert answer.get("successful"), answer
         client.until(value, True)
 
     with visitor():

@@ -13,6 +13,7 @@ import asyncio
 import logging
 from collections.abc import Coroutine, Iterable, Mapping
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any
 
 import pybase64
@@ -44,6 +45,13 @@ RETRY = 2.0
 
 #: Seconds that a node may take to send all its parameters.
 READ_TIMEOUT = 5.0
+
+#: Seconds that the other services of a node may take to be discovered after the first: each is
+#: announced by itself, and who sees a value may set it at once.
+DISCOVERY = 2.0
+
+#: Seconds between two looks for one of them.
+LOOK = 0.05
 
 #: Parameters that one request asks for.
 CHUNK = 200
@@ -163,11 +171,21 @@ class ParameterRoutes(ParameterTopics[_NodeParameters]):
         self, node: _NodeParameters, verb: str, kind: str, request: bytes
     ) -> dict[str, Any]:
         type_name = f"rcl_interfaces/srv/{kind}"
-        response = await self._requests.ask(f"{node.name}/{verb}", type_name, request)
+        service = f"{node.name}/{verb}"
+        await self._discover(node, service)
+        response = await self._requests.ask(service, type_name, request)
         try:
             return self._converters.get(f"{type_name}_Response").to_dict(response)
         except UnknownTypeError as error:
             raise CallError("unknown_type", str(error)) from None
+
+    async def _discover(self, node: _NodeParameters, service: str) -> None:
+        """Wait until a service of a node is on the bus, unless it does not come."""
+        last = monotonic() + DISCOVERY
+        while service not in self._requests.services and not node.is_gone:
+            if monotonic() >= last:
+                return
+            await asyncio.sleep(LOOK)
 
     def _load(self, node: _NodeParameters) -> None:
         """Read a node's parameters in the background, again until none has changed meanwhile."""

@@ -10,10 +10,11 @@ from waiting import until
 pytest.importorskip("rcl_interfaces.srv")
 from call_harness import AllTypes, CallHarness, action, call_routes, parameters
 
+import appliance.ros.calls.parameters
 from appliance.ros.calls import parameter_events
 from appliance.ros.calls.dispatcher import CallError
 from appliance.ros.calls.parameter_events import EVENT, EVENTS
-from appliance.ros.calls.parameters import to_value
+from appliance.ros.calls.parameters import LOOK, to_value
 from appliance.ros.node import FakeNode
 from appliance.ros.payload.converter import Converters
 from appliance.ros.payload.definitions import load_description
@@ -26,6 +27,7 @@ class Declaring:
 
     def __init__(self, harness, name="/arm", **values):
         self.name = name
+        self.node = harness.node
         self.values = values
         self.unset = set()
         self.asked = []
@@ -35,9 +37,13 @@ class Declaring:
             ("list_parameters", "ListParameters", self.on_list),
             ("get_parameters", "GetParameters", self.on_get),
         ):
-            type_name = f"rcl_interfaces/srv/{kind}"
-            harness.node.add_service(f"{name}/{verb}", type_name, self._handler(type_name, answer))
+            self.offer(verb, kind, answer)
         self.events = harness.node.add_publisher(EVENTS, EVENT)
+
+    def offer(self, verb, kind, answer):
+        type_name = f"rcl_interfaces/srv/{kind}"
+        handler = self._handler(type_name, answer)
+        self.node.add_service(f"{self.name}/{verb}", type_name, handler)
 
     def _handler(self, type_name, answer):
         def handle(cdr, respond):
@@ -137,7 +143,37 @@ async def test_a_parameter_that_cannot_be_read_hides_no_others(harness):
     assert harness.retained("r2d2/arm/_param/void") is None
 
 
-async def test_the_appliance_stops_just_when_a_node_cannot_be_read(harness):
+async def test_a_value_is_set_before_all_services_of_its_node_are_discovered(harness):
+    harness.start(parameters("/arm/*"))
+    arm = Declaring(harness, speed=1)
+    harness.node.spin()
+    await shown(harness, "speed", 1)
+    client = harness.client("alice")
+    call = asyncio.create_task(client.call("r2d2/arm/_param/speed/set", b"2"))
+    await asyncio.sleep(4 * LOOK)
+    assert not call.done()
+    for verb, kind, answer in (
+        ("describe_parameters", "DescribeParameters", {"descriptors": [{"type": 2}]}),
+        ("set_parameters", "SetParameters", {"results": [{"successful": True}]}),
+    ):
+        arm.offer(verb, kind, lambda request, answer=answer: answer)
+        await asyncio.sleep(2 * LOOK)
+        harness.node.spin()
+    assert await call == ("ok", {"successful": True, "reason": ""})
+
+
+async def test_a_service_that_a_node_does_not_have_is_not_waited_for_long(harness, monkeypatch):
+    monkeypatch.setattr(appliance.ros.calls.parameters, "DISCOVERY", 0.1)
+    harness.start(parameters("/arm/*"))
+    Declaring(harness, speed=1)
+    harness.node.spin()
+    await shown(harness, "speed", 1)
+    code, message = await harness.client("alice").error("r2d2/arm/_param/speed/set", b"2")
+    assert (code, message) == ("unavailable", "there is no /arm/describe_parameters on the bus")
+
+
+async def test_the_appliance_stops_just_when_a_node_cannot_be_read(harness, monkeypatch):
+    monkeypatch.setattr(appliance.ros.calls.parameters, "DISCOVERY", 0.0)
     harness.start(parameters("/mute/*"))
     kind = "rcl_interfaces/srv/GetParameters"
     harness.node.add_service("/mute/get_parameters", kind, lambda request, respond: None)
