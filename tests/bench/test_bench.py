@@ -17,6 +17,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from waiting import PATIENCE
 
 from appliance import bench
 from appliance.bench import cells, client, command, conversion, drain, ends, growth, load, report
@@ -243,6 +244,7 @@ def test_no_round_is_no_measurement(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @needs_mosquitto
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_it_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:
     # A shell without job control lets what it starts in the background ignore SIGINT.
@@ -259,15 +261,15 @@ def test_interrupted_it_leaves_nothing_behind(tmp_path: Path, number: signal.Sig
     )
     children: list[psutil.Process] = []
     try:
-        until = time.monotonic() + 30
+        until = time.monotonic() + 2 * PATIENCE
         while len(children) < 3 and time.monotonic() < until:  # both brokers and the load
             assert process.poll() is None
             time.sleep(0.05)
             children = psutil.Process(process.pid).children(recursive=True)
         assert len(children) == 3
         process.send_signal(number)
-        output, _ = process.communicate(timeout=30)
-        _, alive = psutil.wait_procs(children, timeout=5)
+        output, _ = process.communicate(timeout=2 * PATIENCE)
+        _, alive = psutil.wait_procs(children, timeout=PATIENCE)
         assert process.returncode == 130, output
         assert not alive
         assert not list(tmp_path.iterdir())

@@ -8,11 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE
 
 from appliance.host.watch import watch
 
 #: Seconds that a change may take to be told of, and none that are not told of.
-SOON = 5.0
+SOON = PATIENCE
 NEVER = 1.5
 
 

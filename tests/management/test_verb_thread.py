@@ -86,10 +86,15 @@ async def test_a_reload_waits_for_no_verb(site: Site, monkeypatch: pytest.Monkey
 
 
 async def test_what_waits_at_the_end_is_told(thread: VerbThread):
-    go_on = threading.Event()
-    first = asyncio.create_task(thread.run("a", lambda: go_on.wait(PATIENCE)))
+    begun, go_on = threading.Event(), threading.Event()
+
+    def work() -> bool:
+        begun.set()
+        return go_on.wait(PATIENCE)
+
+    first = asyncio.create_task(thread.run("a", work))
     second = asyncio.create_task(thread.run("b", lambda: None))
-    await asyncio.sleep(0)
+    await until(begun.is_set, "the first")
     closing = asyncio.create_task(thread.close())
     await asyncio.sleep(0)
     go_on.set()

@@ -20,6 +20,9 @@ from appliance.ops.doctor import links as module
 from appliance.ops.doctor.links import links
 from appliance.ops.finding import Finding
 
+#: Seconds for one step: a busy computer may stand still for some.
+STEP = 10.0
+
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Iterator[FleetMosquitto]:
@@ -43,7 +46,7 @@ def examined(directory: Path, *sections: dict[str, Any]) -> list[Finding]:
 def test_each_server_is_reached_or_the_step_is_named(
     tmp_path: Path, fleet: FleetMosquitto, silent: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "STEP_TIMEOUT", 1.0)
+    monkeypatch.setattr(module, "STEP_TIMEOUT", STEP)
     ca = {"ca": str(fleet.directory / "certs/ca.crt")}
     tls, plain = f"mqtts://127.0.0.1:{fleet.port}", f"mqtt://127.0.0.1:{fleet.plain_port}"
     began = time.monotonic()
@@ -55,7 +58,7 @@ def test_each_server_is_reached_or_the_step_is_named(
         {"name": "late", "servers": [plain, f"ws://127.0.0.1:{silent}/mqtt"]},
         {"name": "proxy", "servers": [plain], "proxy": f"http://127.0.0.1:{silent}"},
     )
-    assert time.monotonic() - began < 15
+    assert time.monotonic() - began < 3 * STEP, "the silent ones are asked at once"
     told = [(each.subject.split()[1], each.level, each.text) for each in found]
     levels = [(name, level) for name, level, _ in told]
     assert levels == [

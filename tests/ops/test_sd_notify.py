@@ -16,7 +16,7 @@ import pytest
 import yaml
 from raw_client import RawClient
 from service.supervisor import NotifySocket, Supervised
-from waiting import eventually
+from waiting import eventually, until
 
 from appliance.broker.faults import Faults
 from appliance.net.callbacks import Entries
@@ -24,6 +24,9 @@ from appliance.ops.control import ask
 from appliance.ops.sd_notify import Notifier
 
 WATCHDOG = 1.0
+
+#: Of one that may stand still for seconds, on a busy computer, with signs of life in time yet.
+PATIENT_WATCHDOG = 12.0
 
 
 def entries(loop: asyncio.AbstractEventLoop | None = None) -> Entries:
@@ -38,16 +41,16 @@ def notify(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[NotifySoc
 
 def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
     appliance = Supervised(tmp_path / "house")
-    appliance.supervise(notify, WATCHDOG)
+    appliance.supervise(notify, PATIENT_WATCHDOG)
     appliance.start()
     try:
         with RawClient(appliance, 5, tls=True) as client:  # MQTT answers as soon as it is ready
             client.connect("first")
         assert notify.all("STATUS") == ["0 clients, without ROS"]
 
-        notify.wait(lambda: len(notify.all("WATCHDOG")) >= 4, "signs of life")
+        notify.wait(lambda: len(notify.all("WATCHDOG")) >= 3, "signs of life")
         beats = [when for when, fields in notify.messages if "WATCHDOG" in fields]
-        assert all(b - a < 0.9 * WATCHDOG for a, b in itertools.pairwise(beats))
+        assert all(b - a < 0.9 * PATIENT_WATCHDOG for a, b in itertools.pairwise(beats))
 
         for reloading in (
             lambda: ask(tmp_path / "house/state/control.sock", "reload"),
@@ -78,10 +81,12 @@ def test_what_systemd_is_told(tmp_path: Path, notify: NotifySocket) -> None:
 #: one: its threads go on with SIGCONT, and walking the frames of a thread that runs can crash.
 HANGING = """\
 import time
+from pathlib import Path
 from amqtt.plugins.base import BasePlugin
 
 class Hanging(BasePlugin):
     async def on_broker_client_connected(self, **_):
+        Path(__file__).with_name("hangs").touch()
         time.sleep(3600)
 """
 
@@ -103,6 +108,7 @@ def _hang(house: Path, notify: NotifySocket) -> None:
         appliance.start()
         with RawClient(appliance, 5, tls=True) as client:
             client.socket.sendall(client.connect_packet("any"))
+            eventually((house.parent / "hangs").exists, "the plugin to hang")
             assert appliance.watch() == -signal.SIGABRT
         appliance.start()
         (line,) = appliance.wait_for_log("the last run crashed on .*Fatal Python error: Aborted")
@@ -212,18 +218,22 @@ async def test_a_status_that_fails_does_not_end_the_signs_of_life(
     with NotifySocket() as notify:
         notifier = Notifier(notify.address, 0.1)
         notifier.start(own, lambda: next(texts), lambda: True)
-        await asyncio.sleep(0.3)
+        await until(lambda: own.faults.count > 2 and len(notify.all("WATCHDOG")) > 5)
         notifier.close()
-        assert own.faults.count > 2 and len(notify.all("WATCHDOG")) > 5
     escaped.clear()
 
 
 async def test_without_a_sign_of_life_systemd_is_told_none() -> None:
-    lives = iter([True, True, False])
+    asked: list[bool] = []
+
+    def is_alive() -> bool:
+        asked.append(len(asked) < 2)
+        return asked[-1]
+
     with NotifySocket() as notify:
         notifier = Notifier(notify.address, 0.1)
-        notifier.start(entries(), lambda: "fine", lambda: next(lives, False))
-        await asyncio.sleep(0.3)
+        notifier.start(entries(), lambda: "fine", is_alive)
+        await until(lambda: len(asked) > 6 and len(notify.all("WATCHDOG")) >= 2)
         notifier.close()
         assert len(notify.all("WATCHDOG")) == 2
 

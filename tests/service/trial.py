@@ -23,6 +23,8 @@ class ServiceTrial(Ordeal):
     `appliance install`.
     """
 
+    least = 100
+
     def __init__(
         self,
         directory: Path,
