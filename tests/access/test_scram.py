@@ -674,7 +674,7 @@ CONTINUE, AGAIN = ReasonCode.CONTINUE_AUTHENTICATION, ReasonCode.RE_AUTHENTICATE
 #: CONNACK with nothing but the reason: what a client that is refused is told.
 REFUSED = {code: bytes((0x20, 3, 0, code, 0)) for code in (0x82, 0x87, 0x8C)}
 #: Seconds from the connection to the end of the login.
-CONNECT_TIMEOUT = 3
+CONNECT_TIMEOUT = 10
 
 
 @pytest.fixture(scope="module")

@@ -115,8 +115,8 @@ def test_who_is_silent_is_hung_up_upon(dial: Dial, name: str, topic: str) -> Non
     watcher = joined(dial, f"watcher-{name}")
     watcher.send(Subscribe(1, [Subscription(topic)]))
     assert watcher.receive() == wire("90 03 0001 00")
-    client = joined(dial, name, keep_alive=1, will=Will(topic, b"gone"))
     before = time.monotonic()
+    client = joined(dial, name, keep_alive=1, will=Will(topic, b"gone"))
     assert client.receive() == b""
     assert 1.4 < time.monotonic() - before < PATIENCE
     assert watcher.receive() == packet(0x30, field(topic), b"gone")

@@ -136,8 +136,8 @@ def test_one_and_a_half_keep_alive_of_silence(dial: Dial, name: str, topic: str)
     watcher = joined(dial, f"{name}-watcher", "bob")
     watcher.send(Subscribe(1, [Subscription(topic)]))
     assert watcher.receive() == wire("90 04 0001 00 00")
-    client = joined(dial, name, keep_alive=1, will=Will(topic, b"gone"))
     began = time.monotonic()
+    client = joined(dial, name, keep_alive=1, will=Will(topic, b"gone"))
     assert client.receive() == disconnect(0x8D)
     assert client.receive() == b""
     assert 1.4 < time.monotonic() - began < PATIENCE

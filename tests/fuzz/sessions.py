@@ -20,6 +20,7 @@ from typing import Any
 from appliance_process import ApplianceProcess
 from codec import Found
 from inputs import CLIENTS_OWN, Source, chunks, damage
+from waiting import until
 
 from appliance.mqtt.codec import PacketType, decode_varint
 from appliance.mqtt.packets import (
@@ -264,10 +265,12 @@ class Siege:
         stop = asyncio.Event()
         password = self.appliance.passwords["alice"].encode()
         singing = asyncio.ensure_future(self.canary.sing(self.appliance.plain_port, password, stop))
-        end = time.monotonic() + seconds
-        warm = time.monotonic() + min(seconds / 4, 60.0)
         running: set[asyncio.Future[None]] = set()
         try:
+            # Its login is not to wait behind a busy computer's first handshakes.
+            await until(lambda: self.canary.heard or singing.done(), "the canary to sing")
+            end = time.monotonic() + seconds
+            warm = time.monotonic() + min(seconds / 4, 60.0)
             while time.monotonic() < end and not singing.done():
                 while len(running) < AT_A_TIME:
                     self.count += 1

@@ -83,12 +83,13 @@ class Strangers(Siege):
         self._foreign.load_cert_chain(f"{alices}.crt", f"{alices}.key")
         [line] = self.appliance.wait_for_log(r"listening for WebSocket on \S+:\d+$")
         self._web_port = int(line.rpartition(":")[2])
-        with RawClient(self.appliance, V5) as phone, RawClient(self.appliance, V5) as alice:
+        with RawClient(self.appliance, V5) as phone:
             _log_in(phone, PHONE)
             topics = [Subscription("r2d2/waiting/#", 2), Subscription("r2d2/kept/+", 0)]
             phone.send(Subscribe(1, topics))
             assert isinstance(phone.decode(phone.receive()), Suback)
             phone.kill()
+        with RawClient(self.appliance, V5) as alice:
             _log_in(alice, "alice")
             for number in range(WAITING):
                 self._left.append(("r2d2/waiting/x", self._treasure + b" %d" % number))

@@ -103,7 +103,7 @@ class Robot:
 
 def find(computer: Computer, *arguments: str | Path, code: int = 0) -> list[dict[str, Any]]:
     done = subprocess.run(
-        computer.command(*APPLIANCE, "find", "--json", "--timeout", "0.5", *arguments),
+        computer.command(*APPLIANCE, "find", "--json", "--timeout", "3", *arguments),
         capture_output=True,
         text=True,
         env=environment(),

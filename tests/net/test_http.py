@@ -287,7 +287,7 @@ async def test_who_sends_nothing_more_is_answered(harness: WebHarness):
 async def test_slow_heads_and_silent_connections_end(
     harness: WebHarness, tls: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
-    await harness.start(connect_timeout=1.0)
+    await harness.start(connect_timeout=3.0)
     silent, slow = await harness.dial(tls), await harness.dial(tls)
     await slow.send(GET[:1])
 
@@ -317,7 +317,7 @@ async def test_idle_connections_end(harness: WebHarness, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("tls", [False, True])
 async def test_a_reader_that_stops(harness: WebHarness, tls: bool):
     """It is read no more, its memory is bounded and counted, and it ends."""
-    await harness.start(connect_timeout=1.0)
+    await harness.start(connect_timeout=3.0)
     peer = await harness.dial(tls, receive_buffer=4096)
     peer.writer.transport.pause_reading()
     await peer.send(GET.replace(b"small", b"large") * 100)
@@ -581,7 +581,7 @@ UPGRADE = (
 async def test_a_websocket_behind_requests_with_its_connect_at_once(
     harness: WebHarness, tls: bool
 ) -> None:
-    await harness.start(connect_timeout=1.0)
+    await harness.start(connect_timeout=3.0)
     peer = await harness.dial(tls)
     packet = Connect("hasty").encode(5)
     frame = bytes((0x82, 0x80 | len(packet))) + bytes(4) + packet
@@ -592,12 +592,12 @@ async def test_a_websocket_behind_requests_with_its_connect_at_once(
     head = await asyncio.wait_for(peer.reader.readexactly(2), PATIENCE)
     data = await peer.reader.readexactly(head[1])
     assert isinstance(decode_packet(data[0], data[2:], 5), Connack)
-    await asyncio.sleep(1.2)  # no time limit of HTTP holds for it
+    await asyncio.sleep(3.2)  # no time limit of HTTP holds for it
     assert harness.protocol("hasty")
 
 
 async def test_a_websocket_that_never_logs_in_ends(harness: WebHarness):
-    await harness.start(connect_timeout=0.5)
+    await harness.start(connect_timeout=3.0)
     peer = await harness.dial()
     await peer.send(UPGRADE)
     assert (await answer(peer, body=False))[0] == 101

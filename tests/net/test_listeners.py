@@ -164,12 +164,13 @@ async def test_a_refused_client_hears_why(harness: Harness, tls):
 @pytest.mark.parametrize("said", [b"", b"\x10", b"\x10\x20\x00\x04MQTT"])
 @both
 async def test_who_does_not_connect_in_time_is_cut_off(harness: Harness, tls, said, caplog):
-    await harness.start(connect_timeout=0.2)
+    seconds = 3.0 if tls else 0.2  # in which also the handshake is
+    await harness.start(connect_timeout=seconds)
     peer = await harness.dial(tls)
     await peer.send(said)
     assert await peer.receive_rest() == b""
     await until(lambda: not harness.scheduler.connections)
-    assert "no complete CONNECT within 0.2 s" in caplog.text
+    assert f"no complete CONNECT within {seconds:g} s" in caplog.text
 
 
 async def test_who_does_not_shake_hands_in_time_is_cut_off(harness: Harness):
@@ -972,7 +973,7 @@ async def test_publishes_over_the_rate_are_read_later(harness: Harness, tls):
             await calm.send(Publish("b", b"", 1, packet_id=1))
             assert isinstance(await calm.receive(), Puback)
     # A second's worth may come at once.
-    assert 0.6 < loop.time() - began < 6
+    assert 0.6 < loop.time() - began < PATIENCE
 
 
 async def test_a_rate_holds_for_the_smallest_messages(harness: Harness):
@@ -980,11 +981,12 @@ async def test_a_rate_holds_for_the_smallest_messages(harness: Harness):
     await harness.start(publish_rate=100)
     peer = await harness.log_in("tiny")
     counters = harness.broker.counters
+    began = time.monotonic()
     await peer.send(Publish("a", b"").encode(5) * 5000)
-    await asyncio.sleep(0.3)
-    assert 0 < counters.publish_received <= 250
-    await asyncio.sleep(0.5)
-    assert counters.publish_received <= 300
+    await until(lambda: counters.publish_received)
+    for _ in range(8):
+        assert counters.publish_received <= 200 + 100 * (time.monotonic() - began)
+        await asyncio.sleep(0.1)
     peer.hang_up()
 
 
@@ -1105,11 +1107,14 @@ async def test_publishers_are_slowed_while_memory_is_short(small_house: Harness,
         assert await publish(5 * scheduler.FEW_MESSAGES, 5) > 4 * wire.SHORT_OF_MEMORY_PAUSE
         assert "is slowed" in caplog.text and "broker.limits.memory" in caplog.text
         reader = await harness.log_in("reader")
-        began = loop.time()
-        for _ in range(50):
-            await reader.send(Pingreq())
-            await reader.receive()
-        assert loop.time() - began < 25 * wire.SHORT_OF_MEMORY_PAUSE
+        took = []
+        for _ in range(3):  # a busy computer may stand still in one of them
+            began = loop.time()
+            for _ in range(50):
+                await reader.send(Pingreq())
+                await reader.receive()
+            took.append(loop.time() - began)
+        assert min(took) < 25 * wire.SHORT_OF_MEMORY_PAUSE
     finally:
         accounting.queued_bytes -= 7 * MIB
 

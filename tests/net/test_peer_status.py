@@ -77,11 +77,12 @@ async def test_who_leaves_or_is_closed_while_something_is_withheld(harness):
     gone, closed = await harness.log_in("gone"), await harness.log_in("closed")
     for name, peer in (("gone", gone), ("closed", closed)):
         wire = harness.protocol(name)
-        wire.withhold(0.2)
+        wire.withhold(PATIENCE)
         await peer.send(Pingreq())
         await until_waiting(wire)
-    harness.protocol("closed").close()
+    wire.close()
     gone.writer.transport.abort()
+    wire.withhold(0)  # as the end of that time does
     assert isinstance(await closed.receive(), Pingresp)
     with pytest.raises((asyncio.IncompleteReadError, ConnectionError)):
         await closed.receive()

@@ -28,6 +28,7 @@ from appliance.broker.faults import Faults
 from appliance.net import tls
 from appliance.net.callbacks import Entries
 from appliance.net.layers import Schedulable, UpperLayer
+from appliance.net.sockets import receive_buffer
 from appliance.net.tls import RECORD_SIZE, RECORDS_A_TURN, TlsTransport
 
 # The way that is left to override it, and to have both loops, is too new for some computers.
@@ -859,12 +860,15 @@ async def test_new_keys_and_a_refused_renegotiation(server, directory, version, 
         await own(accepted, server, served, PATIENCE)
         process.stdin.write(b"before\n")
         assert await asyncio.wait_for(process.stdout.readline(), PATIENCE) == b"before\n"
+        sock = served.transport.get_extra_info("socket")
+        before = receive_buffer(sock).received
         process.stdin.write(command.encode() + b"\n")
         if command == "R":
             await served.ended()  # it does not want to stay without
             assert isinstance(served.error, ssl.SSLError)
         else:
-            await asyncio.sleep(0.05)  # a command is one only when it comes alone
+            # A command is one only when it comes alone.
+            await until(lambda: receive_buffer(sock).received > before, "the new keys")
             process.stdin.write(b"behind\n")
             assert await asyncio.wait_for(process.stdout.readline(), PATIENCE) == b"behind\n"
             process.stdin.write(b"Q\n")

@@ -286,7 +286,7 @@ async def test_what_is_no_http_is_closed_at_once(harness: Harness, said, caplog)
 
 @both
 async def test_the_time_to_connect_begins_before_http(harness: Harness, tls, caplog):
-    await harness.start(connect_timeout=0.3)
+    await harness.start(connect_timeout=3.0)
     harness.ports[0:2] = harness.ports[2:4]
     silent, dripping = await harness.dial(tls), await harness.dial(tls)
     upgraded = await shake_hands(harness, tls)
@@ -298,7 +298,7 @@ async def test_the_time_to_connect_begins_before_http(harness: Harness, tls, cap
                 break
     for peer in (silent, dripping, upgraded):
         assert await peer.receive_rest() == b""
-    assert caplog.text.count("no complete CONNECT within 0.3 s") == 3
+    assert caplog.text.count("no complete CONNECT within 3 s") == 3
 
 
 # --- frames --------------------------------------------------------------------------------------
@@ -652,7 +652,7 @@ async def test_what_was_said_before_the_login_and_the_close_frame_is_done(harnes
 
 async def test_who_closes_before_the_login_is_not_waited_for_longer_than_others(harness: Harness):
     harness.gate.clear()
-    await harness.start(connect_timeout=0.3)
+    await harness.start(connect_timeout=3.0)
     peer = await shake_hands(harness)
     await peer.send(frame(Connect("brief").encode(5)) + frame(b"", Opcode.CLOSE))
     await until(lambda: not harness.scheduler.connections)
@@ -863,7 +863,8 @@ async def test_what_waits_for_a_turn_below_is_held(harness: Harness, tls, in_fra
     begun = loop.time()
     peer.writer.write(packet)
     await until(lambda: held)
-    assert waited[0] / 2 < held[0] <= waited[0] + 0.1
+    # At least the 60 turns of 6 ms; what it waits before it is noticed is not known.
+    assert 0.18 < held[0] <= waited[0] + 0.1
     await until(lambda: not wire._client.inflow.is_behind)
     begun = loop.time()
     peer.writer.write(packet)

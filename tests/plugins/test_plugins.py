@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from aiohttp import web
 from test_amqtt import Login, connect_of, own, running
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance.broker.values import Action, Decision, Identity, Refusal
 from appliance.config import secrets_in
@@ -192,13 +192,16 @@ async def test_so_many_at_once_and_no_more(
     backend: Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(logins_module, "MAX_LOGINS", 3)
-    async with running(backend.plugins(), plugin_timeout=1.5) as rig:
-        asks = [
-            rig.login.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
-            for n in range(10)
-        ]
-        answers = await asyncio.gather(*asks)
+    async with running(backend.plugins(), plugin_timeout=5.0) as rig:
+        asks = asyncio.gather(
+            *(
+                rig.login.authenticate(connect_of("slow", b"%d" % n), f"10.0.0.{n}:1")
+                for n in range(10)
+            )
+        )
+        await until(lambda: len(backend.asked) >= 3)
         assert len(backend.asked) == 3
+        answers = await asks
         assert {code_of(answer) for answer in answers} == {ReasonCode.SERVER_UNAVAILABLE}
 
 
@@ -414,7 +417,7 @@ async def test_ldap(directory: Directory) -> None:
 
 async def test_a_directory_that_hangs_does_not_stop_the_loop(directory: Directory) -> None:
     plugins = {"amqtt.contrib.ldap.UserAuthLdapPlugin": LDAP, own(Login): {}}
-    async with running(plugins, plugin_timeout=0.3) as rig:
+    async with running(plugins, plugin_timeout=2.0) as rig:
         directory.gate.clear()
         asks = asyncio.gather(
             *(rig.login.authenticate(bob(f"c{number}"), HOST) for number in range(10))
@@ -428,6 +431,7 @@ async def test_a_directory_that_hangs_does_not_stop_the_loop(directory: Director
         assert directory.searches == 1
         directory.gate.set()
         await until(lambda: directory.searches >= 1)
+        rig.frame._guard.timeout = PATIENCE
         assert await rig.login.authenticate(bob(), HOST) == Identity("bob", "c1")
         # Those who had stopped waiting are not asked about any more.
         assert directory.searches == 2

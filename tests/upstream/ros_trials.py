@@ -125,8 +125,12 @@ class RosCalls(Calls):
             link={
                 "out": [*map(dict, OUT), {"topic": f"{WALK}/_result/#", "keep": "all"}],
                 "in": [IN[0], *calls],
+                "keep_alive": "60 s",
             },
-            bridge={"services": [f"/{RESET}"], "actions": [f"/{WALK}"]},
+            bridge={
+                "services": [{"ros": f"/{RESET}", "timeout": "60 s"}],
+                "actions": [{"ros": f"/{WALK}", "timeout": "60 s"}],
+            },
         )
 
     def is_answer(self, payload: bytes) -> bool:

@@ -319,7 +319,7 @@ def cutting(connection: socket.socket) -> None:
 async def test_a_server_that_never_answers(site, tmp_path, scheme, step):
     tls = UpstreamTls(ca=certify(tmp_path, "ca", "x"))  # to read all of the system's takes a while
     with Server(never) as server:
-        error = await site.refusal(f"{scheme}://127.0.0.1:{server.port}", tls, timeout=0.5)
+        error = await site.refusal(f"{scheme}://127.0.0.1:{server.port}", tls, timeout=3.0)
     assert error.step == step and "does not answer" in str(error)
 
 

@@ -224,6 +224,7 @@ async def test_a_link_that_does_not_do_its_duty_is_told(fleet: FakeFleet) -> Non
     scenario.prepare(fleet)
     _, writer = await asyncio.open_connection("127.0.0.1", fleet.port)
     writer.write(Connect("r2d2").encode())
+    await until(lambda: scenario.done(fleet), "the misdeed")
     with pytest.raises(AssertionError, match="CONNACK comes once more"):
         await scenario.outcome(fleet, patience=0.3)
     writer.close()

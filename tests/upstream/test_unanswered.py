@@ -118,7 +118,7 @@ async def test_a_link_works_without_a_filter_and_asks_for_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
     hurry_to_judge(monkeypatch)
-    monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 1.0)
+    monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 5.0)
     command, secret = "fleet/r2d2/cmd/#", "fleet/r2d2/secret/#"
     rules = [{"topic": "secret/#"}, {"topic": "cmd/#"}]
     async with FakeFleet() as fleet:
@@ -158,7 +158,7 @@ async def test_a_link_works_without_a_state_that_the_fleet_does_not_take_and_say
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, how: str
 ) -> None:
     hurry_to_judge(monkeypatch)
-    monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 2.0)
+    monkeypatch.setattr(unanswered_module, "LEFT_OUT_FOR", 6.0)
     state, door = "fleet/r2d2/_appliance/state", "fleet/r2d2/events/door"
     async with FakeFleet() as fleet:
         is_allowed = False

@@ -113,7 +113,7 @@ def device(tmp_path: Path, fleet: FleetMosquitto) -> Iterator[ApplianceDevice]:
     """An appliance in a process of its own, with a link by the profile; not started."""
     link = {
         "profile": {"vda5050": {"manufacturer": "acme", "version": "2.0"}},
-        "keep_alive": "1 s",
+        "keep_alive": "60 s",  # a killed one's end is seen by its connection
         "out": [],
         "in": [],
     }
@@ -165,12 +165,14 @@ async def test_it_sees_a_vehicle_online_commands_it_and_sees_it_offline(
     master.send("order", ORDER)
     (order,) = await node.wait_for(1, "order")
     assert json.loads(order.payload)["orderId"] == "7"
+    await until(lambda: said("order"), "the order there")
     assert order.payload == said("order")[0].payload
 
     await node.publish(f"{HERE}factsheet", b"{}")
     standing = state("7")
     await node.publish(f"{HERE}state", standing)
     await until(lambda: any(each.get("order") == "7" for each in master.lines), "the state")
+    await until(lambda: said("state"), "the state there")
     assert [(packet.payload, packet.qos) for packet in said("state")] == [(standing, 0)]
     await until(lambda: said("factsheet"), "the factsheet")
     later = await MqttClient.dial(fleet.plain_port)
@@ -181,6 +183,7 @@ async def test_it_sees_a_vehicle_online_commands_it_and_sees_it_offline(
 
     await asyncio.to_thread(device.stop)
     await master.sees("ONLINE", "OFFLINE")
+    await until(lambda: len(said("connection")) == 2, "both states of the connection")
     assert [packet.qos for packet in said("connection")] == [1, 1]
     assert {json.loads(packet.payload)["version"] for packet in said("connection")} == {"2.0.0"}
     assert not master.errors
