@@ -113,9 +113,11 @@ class Driver:
         broker.flush()
         self.wire.written = b""
 
-    def say(self, *packets):
+    def say(self, *packets, at=None):
+        """Have these received, now or at another time of the loop's clock."""
         # As a connection does it, once for all that it has received.
-        self.broker.accounting.now = asyncio.get_running_loop().time()
+        now = asyncio.get_running_loop().time()
+        self.broker.accounting.now = now if at is None else at
         self.client.receive(b"".join(packet.encode(self.version) for packet in packets))
         while self.wire.asks_for_turn:  # a conversion has taken its turn, on a busy computer
             self.wire.asks_for_turn = False

@@ -56,7 +56,7 @@ class Peer:
 
     def matched(self, topic, count=1):
         """Wait until the publisher has its subscribers."""
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while self.publishers[topic].get_subscription_count() < count:
             if time.monotonic() > deadline:
                 raise TimeoutError(f"nobody subscribes to {topic}")

@@ -41,7 +41,7 @@ from test_msgs.action import Fibonacci
 
 STEP = 0.05  # seconds
 MOST_STEPS = 500
-UNSTOPPABLE, DOOMED = 13, 99
+UNSTOPPABLE, DOOMED = 113, 99
 
 
 def say(*line):
@@ -117,7 +117,7 @@ class Turtle:
         return CancelResponse.REJECT if stays else CancelResponse.ACCEPT
 
     def on_walk(self, goal):
-        """0 to 500 steps, others are refused; 13 cannot be cancelled, 99 is aborted after two."""
+        """0 to 500 steps, others are refused; 113 cannot be cancelled, 99 is aborted after two."""
         self.walking += 1
         done = 0
         try:
@@ -147,7 +147,7 @@ class Turtle:
 
     def followed(self):
         """Wait until somebody subscribes to the feedback of goals."""
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while not self.node.count_subscribers("/turtle/walk/_action/feedback"):
             if time.monotonic() > deadline:
                 raise TimeoutError("nobody subscribes to the feedback")
@@ -179,12 +179,12 @@ class Turtle:
         """Call /turtle/ask_human, and wait for it."""
         client = self.node.create_client(SetBool, "/turtle/ask_human", callback_group=self.group)
         try:
-            if not client.wait_for_service(5):
+            if not client.wait_for_service(60):
                 return "there is no such service"
             future = client.call_async(SetBool.Request(data=data))
             done = threading.Event()
             future.add_done_callback(lambda _: done.set())
-            if not done.wait(3):
+            if not done.wait(60):
                 client.remove_pending_request(future)
                 return "no answer"
             return [future.result().success, future.result().message]

@@ -6,6 +6,7 @@ import asyncio
 import logging
 
 import pytest
+from waiting import until
 
 from appliance.broker.broker import Broker
 from appliance.broker.histogram import BOUNDS, Histogram
@@ -59,11 +60,8 @@ class DiagnosticsHarness(Harness):
     async def told(self):
         """The next statuses, by name, with their values as a dict."""
         seen = len(self.listener.received)
-        for _ in range(200):
-            if len(self.listener.received) > seen:
-                break
-            await asyncio.sleep(0.005)
-        message = self.converter.to_dict(self.listener.received[-1])
+        await until(lambda: len(self.listener.received) > seen, "the next statuses")
+        message = self.converter.to_dict(self.listener.received[seen])
         assert message["header"]["stamp"]["sec"] > 1_600_000_000
         statuses = message["status"]
         for status in statuses:

@@ -30,13 +30,13 @@ BRIDGE = {
     "topics": [{"ros": "/cmd_vel", "to": "ros", "type": "geometry_msgs/msg/Twist"}],
     "services": [
         "/turtle/*",
-        {"ros": "/turtle/think", "timeout": "300 ms"},
+        {"ros": "/turtle/think", "timeout": "3 s"},
         "/turtle/absent",
         {
             "ros": "/turtle/ask_human",
             "to": "mqtt",
             "type": "std_srvs/srv/SetBool",
-            "timeout": "1 s",
+            "timeout": "5 s",
             "on_error": {"success": False, "message": "nobody"},
         },
     ],
@@ -143,7 +143,7 @@ def test_services_that_are_absent_silent_or_vanish(client_of, robot, version):
     )
     assert client.error(f"{TURTLE}/think/_call") == (
         "timeout",
-        "no answer from /turtle/think within 0.3 s",
+        "no answer from /turtle/think within 3 s",
     )
     code, message = client.error(f"{TURTLE}/pen/_call", {"data": "yes"})
     assert code == "bad_request" and message.startswith("data: expected true or false")
@@ -241,7 +241,10 @@ def test_several_goals_at_once_to_their_ends(client_of, version):
     }
     client.until(f"{WALK}/_feedback/{goals[6]}", {"sequence": [5, 8, 13]})
     feedback = client.payloads(f"{WALK}/_feedback/{goals[6]}")
-    assert feedback[0] == {"sequence": [0, 1, 1]} and 3 <= len(feedback) <= 6
+    # The newest goes to a client that is slow, and none comes twice.
+    steps = [[0, 1, 1], [1, 1, 2], [1, 2, 3], [2, 3, 5], [3, 5, 8], [5, 8, 13]]
+    every = [{"sequence": step} for step in steps]
+    assert feedback == [step for step in every if step in feedback]
 
     def ended():
         return {
@@ -327,7 +330,7 @@ def test_goals_that_are_refused(client_of):
     code, message = client.error(f"{WALK}/_cancel", {"goal_id": "00" * 15 + "01"})
     assert code == "unknown_goal"
     assert client.error(f"{WALK}/_cancel", {"goal": 1})[0] == "bad_request"
-    goal = client.call(f"{WALK}/_goal", {"order": 13})["goal_id"]
+    goal = client.call(f"{WALK}/_goal", {"order": 113})["goal_id"]
     assert client.error(f"{WALK}/_cancel", {"goal_id": goal}) == (
         "rejected",
         "the action's server does not cancel it",
@@ -344,15 +347,15 @@ def test_a_client_that_comes_back_gets_its_goals_result(client_of, robot, versio
     name = f"tablet-{uuid.uuid4().hex[:6]}"
     client = client_of(version, name=name, keeps=True)
     client.subscribe(f"{WALK}/_result/+")
-    goal = client.call(f"{WALK}/_goal", {"order": 7})["goal_id"]
+    goal = client.call(f"{WALK}/_goal", {"order": 100})["goal_id"]
     client.drop()
-    robot.hear("walked", 7, 7)
+    robot.hear("walked", 100, 100)
     back = client_of(version, name=name, keeps=True)
     assert back.next(f"{WALK}/_result/{goal}")["status"] == "succeeded"
     # One that had no session finds it retained.
     late = client_of(version)
     late.subscribe(f"{WALK}/_result/{goal}")
-    assert len(late.next(f"{WALK}/_result/{goal}")["result"]["sequence"]) == 9
+    assert len(late.next(f"{WALK}/_result/{goal}")["result"]["sequence"]) == 102
 
 
 def test_the_goals_of_a_client_that_has_gone_are_cancelled_when_the_route_says_so(

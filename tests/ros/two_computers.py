@@ -74,7 +74,9 @@ def main():
     with subprocess.Popen(["unshare", "-n", "sleep", "600"]) as other:
         talkers = []
         try:
-            time.sleep(0.5)
+            own = Path("/proc/self/ns/net").readlink()
+            while Path(f"/proc/{other.pid}/ns/net").readlink() == own:
+                time.sleep(0.05)
             ip("link", "add", "here", "type", "veth", "peer", "name", "there")
             ip("link", "set", "there", "netns", str(other.pid))
             for device, address, inside in (

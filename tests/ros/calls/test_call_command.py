@@ -24,7 +24,7 @@ from appliance.ops.init import initialise
 
 BRIDGE = {
     "node": "bridge",
-    "services": ["/turtle/*", {"ros": "/turtle/think", "timeout": "300 ms"}, "/absent"],
+    "services": ["/turtle/*", {"ros": "/turtle/think", "timeout": "3 s"}, "/absent"],
     "actions": [{"ros": "/turtle/walk", "encoding": "cbor"}],
     "parameters": [{"ros": ["/turtle/*", "!/turtle/gains"], "encoding": "cbor"}],
 }
@@ -92,7 +92,7 @@ def test_a_call_prints_its_answer(run, version):
 
 def test_a_call_that_fails_says_why(run):
     for arguments, what in (
-        (("/turtle/think",), "appliance: timeout: no answer from /turtle/think within 0.3 s"),
+        (("/turtle/think",), "appliance: timeout: no answer from /turtle/think within 3 s"),
         (("/absent",), "appliance: unavailable: there is no /absent on the bus"),
         (("/nowhere",), "appliance: nothing takes calls at r2d2/nowhere/_call: no route is for it"),
         (("/turtle/pen", '{"data": 1}'), "appliance: bad_request: data: expected true or false"),
@@ -146,7 +146,7 @@ def test_goals_that_do_not_succeed(run):
     assert code == 1 and output.splitlines()[1:] == ['aborted {"sequence":[0,1,1,2]}']
     code, output, _ = run("goal", "/turtle/walk", '{"order": 300}', "-W", "0.3")
     assert code == 1 and output.splitlines()[-1].startswith("canceled {")
-    code, _, errors = run("goal", "/turtle/walk", '{"order": 13}', "-W", "0.1", "--no-feedback")
+    code, _, errors = run("goal", "/turtle/walk", '{"order": 113}', "-W", "0.1", "--no-feedback")
     assert code == 1 and "goes on: rejected: the action's server does not cancel it" in errors
 
 

@@ -204,7 +204,7 @@ async def test_numbers_and_bytes_keep_their_form_in_cbor(harness):
 
 
 async def test_a_service_that_mqtt_answers_in_cbor(harness):
-    harness.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=0.5, encoding="cbor"))
+    harness.start(service("/ask", to="mqtt", type=SET_BOOL, timeout=60, encoding="cbor"))
     harness.node.spin()
     client = harness.client("alice", "r2d2/ask/_request/+")
     for said, make in ((None, "cbor"), ("application/json", "json"), ("application/cdr", "cdr")):

@@ -17,6 +17,7 @@ def attack(tmp_path_factory):
         yield attack
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize(
     "name",
     [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from waiting import until
+from waiting import PATIENCE, until
 
 pytest.importorskip("rcl_interfaces.srv")
 from call_harness import AllTypes, CallHarness, action, call_routes, parameters
@@ -143,7 +143,8 @@ async def test_a_parameter_that_cannot_be_read_hides_no_others(harness):
     assert harness.retained("r2d2/arm/_param/void") is None
 
 
-async def test_a_value_is_set_before_all_services_of_its_node_are_discovered(harness):
+async def test_a_value_is_set_before_all_services_of_its_node_are_discovered(harness, monkeypatch):
+    monkeypatch.setattr(appliance.ros.calls.parameters, "DISCOVERY", PATIENCE)
     harness.start(parameters("/arm/*"))
     arm = Declaring(harness, speed=1)
     harness.node.spin()

@@ -57,7 +57,7 @@ def client(appliance):
 
 def next_on(client, topic):
     while True:
-        message = client.received.get(timeout=10)
+        message = client.received.get(timeout=60)
         if message.topic == topic:
             return message
 

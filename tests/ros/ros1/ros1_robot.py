@@ -96,7 +96,7 @@ class Robot:
         self.publishers[topic].publish(*values)
 
     def connected(self, topic):
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 60
         while not self.publishers[topic].get_num_connections():
             if time.monotonic() > deadline:
                 raise TimeoutError(f"nobody subscribes to {topic}")

@@ -58,8 +58,9 @@ async def both_ways(harness: Harness, peer: Peer) -> None:
     await until(lambda: len(harness.payloads("r2d2/image")) == IMAGES, "all images")
     image = harness.payloads("r2d2/image")[0]
     assert len(image) > 1_000_000
-    for _ in range(20):
+    for number in range(20):
         harness.send("r2d2/back", image)
+        await until(lambda number=number: len(peer.received) > number - 5, "the images before")
         await asyncio.sleep(0.02)
     await until(lambda: len(peer.received) == 20, "all images on the way back")
 

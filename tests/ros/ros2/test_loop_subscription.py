@@ -262,7 +262,7 @@ async def test_subscriptions_come_and_go_while_messages_come(harness, peer):
         return {topic for topic in ("/a", "/b") if harness.node.count(topic)[1]}
 
     files = open_files()
-    publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 4000, 2000))
+    publishing = asyncio.create_task(peer.do("publish", "/a", string("one").hex(), 12_000, 2000))
     loops = 0
     while not publishing.done():
         harness.bridge.replace(routes[1:])

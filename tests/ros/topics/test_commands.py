@@ -65,6 +65,7 @@ from command_harness import (
     AllAllowed,
     CommandHarness,
     Driver,
+    Wire,
     twist,
 )
 
@@ -96,7 +97,7 @@ async def test_message_expiry(harness):
 
 
 async def test_what_is_sent_again_is_old(harness):
-    harness.start(CommandRules(expire=0.1))
+    harness.start(CommandRules(expire=1.0))
     driver = Driver(harness.broker, "a")
     driver.drive(qos=1, dup=True)
     driver.drive(qos=1, dup=True, properties={Property.CONTENT_TYPE: "application/json"})
@@ -106,7 +107,7 @@ async def test_what_is_sent_again_is_old(harness):
     driver.drive(b'{"linear":{"x":9}}', qos=1)
     assert harness.robot.received == []
     Driver(harness.broker, "b").steer(b'{"linear":{"x":1}}')
-    await asyncio.sleep(0.11)
+    await asyncio.sleep(1.01)
     driver.drive(qos=1)
     await until(lambda: harness.robot.received == [twist(1), twist(0.5)])
 
@@ -313,7 +314,8 @@ async def test_one_client_at_a_time(harness, caplog):
         a.drive()
         b.drive(b'{"linear":{"x":9}}')
     assert set(harness.robot.received) == {twist(0.5)}
-    await until(lambda: "was silent for 0.1 s and commands no more" in caplog.text)
+    await until(lambda: harness.commands.commanding is None, "the end of the lease")
+    assert "was silent for 0.1 s and commands no more" in caplog.text
     b.wire.written = b""
     b.drive(b'{"linear":{"x":0.2}}', qos=1)
     assert b.code == 0
@@ -522,12 +524,18 @@ async def test_who_is_silent_on_a_connection_that_lives_gets_the_stop_message_an
     """A button, Node-RED, the bridge of a mosquitto: they have nothing to say for now."""
     harness.start(CommandRules(on_silence=OnSilence(AFTER)))
     driver = Driver(harness.broker, "a")
+
+    class Answering(Wire):
+        def probe(self):
+            super().probe()
+            self.connection = PeerStatus(silence=0.0)
+
+    driver.wire.__class__ = Answering
     for round_ in range(1, 4):
         driver.wire.connection = PeerStatus(silence=math.inf)
         driver.drive()
         await until(lambda: driver.wire.probed)
         driver.wire.probed = False
-        driver.wire.connection = PeerStatus(silence=0.0)
         await until(lambda: not harness.commands._probed)
         await asyncio.sleep(0.4)
         assert harness.robot.received == [twist(0.5), STOP] * round_
@@ -1396,7 +1404,7 @@ async def test_a_single_command_and_a_cut(harness):
 
 def start_two(harness, mqtt="r2d2/arm"):
     """Two routes to ROS; gives what the second's node receives."""
-    rules = CommandRules(expire=0.5)
+    rules = CommandRules(expire=60.0)
     routes = [
         TopicSettings(ros, "ros", topic, TWIST, rules=rules)
         for ros, topic in (("/cmd_vel", TOPIC), ("/arm", mqtt))
@@ -1441,11 +1449,13 @@ async def test_who_drives_and_was_not_read_for_a_time(harness, qos):
     harness.start(CommandRules(expire=0.5))
     driver = Driver(harness.broker, "a")
     driver.wire.connection = PeerStatus()
-    for _ in range(5):
-        driver.drive(qos=qos)
+    begun = asyncio.get_running_loop().time()
+    for number in range(5):
+        at = begun + 0.06 * number
+        driver.say(Publish(TOPIC, GO, qos=qos, packet_id=7 if qos else None), at=at)
         if qos == 2:
-            driver.say(Pubrel(7))
-        await asyncio.sleep(0.06)
+            driver.say(Pubrel(7), at=at)
+    await asyncio.sleep(0.3)
     assert harness.robot.received
     harness.robot.received.clear()
     driver.wire.connection = PeerStatus(held=3.0)
@@ -1462,10 +1472,10 @@ async def test_a_qos_2_command_is_not_single_when_another_comes_that_is_released
     """Its PUBREC is withheld, to see whether its client waits for that."""
     harness.start(CommandRules(expire=0.5))
     driver = Driver(harness.broker, "a")
-    driver.drive(qos=2)
-    driver.say(Pubrel(7))
-    await asyncio.sleep(0.05)
-    driver.say(Publish(TOPIC, GO, qos=2, packet_id=8))
+    begun = asyncio.get_running_loop().time()
+    driver.say(Publish(TOPIC, GO, qos=2, packet_id=7), at=begun)
+    driver.say(Pubrel(7), at=begun)
+    driver.say(Publish(TOPIC, GO, qos=2, packet_id=8), at=begun + 0.05)
     await asyncio.sleep(0.3)
     assert harness.robot.received == []
     driver.say(Pubrel(8))
@@ -1479,11 +1489,13 @@ async def test_a_stream_that_begins_is_no_reason_to_warn(harness, caplog, qos):
     caplog.set_level(logging.INFO)
     driver = Driver(harness.broker, "a")
     driver.wire.connection = PeerStatus()
+    begun = asyncio.get_running_loop().time()
     for number in range(5):
-        driver.say(Publish(TOPIC, GO, qos=qos, packet_id=number + 1 if qos else None))
+        at = begun + 0.02 * number
+        driver.say(Publish(TOPIC, GO, qos=qos, packet_id=number + 1 if qos else None), at=at)
         if qos == 2:
-            driver.say(Pubrel(number + 1))
-        await asyncio.sleep(0.02)
+            driver.say(Pubrel(number + 1), at=at)
+    await asyncio.sleep(0.1)
     assert harness.robot.received == [twist(0.5)] * 3
     assert harness.counters().expired == 0
     assert harness.counters().last_error is None
@@ -1498,7 +1510,7 @@ async def test_a_stream_that_begins_is_no_reason_to_warn(harness, caplog, qos):
 @pytest.mark.parametrize("pauses", [False, True])
 async def test_a_command_with_something_else_behind_it(harness, pauses):
     """A first command waits for what else there is, and that may be a picture."""
-    harness.start(CommandRules(expire=0.3))
+    harness.start(CommandRules(expire=60.0 if pauses else 0.3))
     driver = Driver(harness.broker, "a")
     driver.wire.connection = PeerStatus(flowing=60.0)
     driver.drive()
@@ -1590,7 +1602,7 @@ async def test_what_waits_is_not_carried_out_behind_a_stop(harness):
 
 async def test_what_has_come_and_was_not_read_is_behind_it(harness):
     """The loop was busy: its timers are early, and its clients late."""
-    harness.start(CommandRules(expire=0.5))
+    harness.start(CommandRules(expire=60.0))
     driver = Driver(harness.broker, "a")
     driver.wire.connection = PeerStatus(has_unread=True)
     driver.drive()
@@ -2446,7 +2458,8 @@ class Stick:
 
 @pytest.mark.parametrize("sticks", [1, 2])
 @pytest.mark.parametrize("size", [0, 20_000])
-async def test_an_idle_stick_overtakes_no_command_of_others(harness, size, sticks):
+async def test_an_idle_stick_overtakes_no_command_of_others(harness, size, sticks, monkeypatch):
+    monkeypatch.setattr(lease, "REPEAT_WITHIN", math.inf)
     harness.start(RULES)
     idle = [Stick(harness, f"stick {number}") for number in range(sticks)]
     for one in idle:

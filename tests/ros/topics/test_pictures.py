@@ -192,9 +192,9 @@ async def test_after_a_fault_at_the_entry_the_next_one_is_converted(
 async def test_the_last_image_of_a_rate_limit_comes_too(harness: Harness) -> None:
     harness.start(to_mqtt("/image", encoding="png", rate=20))
     camera = harness.node.add_publisher("/image", IMAGE, LATCHED)
+    began = time.monotonic()
     for width in range(1, 5):
         camera.publish(image(bytes(3 * width), width, 1))
-    began = time.monotonic()
 
     def widths() -> list[int]:
         harness.node.spin()  # the poll of the graph, which sends what the rate limit kept
