@@ -40,7 +40,7 @@ from std_srvs.srv import SetBool, Trigger
 from test_msgs.action import Fibonacci
 
 STEP = 0.05  # seconds
-MOST_STEPS = 500
+MOST_STEPS = 5000
 UNSTOPPABLE, DOOMED = 113, 99
 
 
@@ -117,7 +117,7 @@ class Turtle:
         return CancelResponse.REJECT if stays else CancelResponse.ACCEPT
 
     def on_walk(self, goal):
-        """0 to 500 steps, others are refused; 113 cannot be cancelled, 99 is aborted after two."""
+        """0 to 5000 steps, others are refused; 113 cannot be cancelled, 99 is aborted after two."""
         self.walking += 1
         done = 0
         try:

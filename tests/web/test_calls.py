@@ -89,7 +89,7 @@ def test_goals(visit: Callable[..., Visit], robot: Robot) -> None:
     page.wait_for_selector(".call:has(strong:text-is('succeeded')) [aria-label=Result]")
     ask(page, '{"order": -1}', "Send goal")
     page.wait_for_selector(".bad:has-text('does not accept')")
-    ask(page, '{"order": 500}', "Send goal")
+    ask(page, '{"order": 5000}', "Send goal")
     running = ".call:has(strong:text-is('executing'))"
     page.wait_for_selector(f"{running} [aria-label=Feedback]")
     wait_for_change(page, f"{running} [aria-label=Feedback]")
@@ -112,7 +112,7 @@ def test_goals_of_others(
     """They are listed, and those of the same user are cancelled, wherever they were sent."""
     page = opened(visit(**PHONE), "/turtle/walk")
     with Peer(appliance, V5) as peer:
-        peer.publish(f"{TURTLE}/walk/_goal/1", '{"order": 500}')
+        peer.publish(f"{TURTLE}/walk/_goal/1", '{"order": 5000}')
         running = ".call:has(button:text-is('Cancel'))"
         page.wait_for_selector(f"{running} [aria-label=Feedback]")
         assert "sent here" not in page.inner_text(running)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from appliance_process import ROBOT, ApplianceProcess, free_ports
-from test_journeys import SPEED, Odometry, hold
+from test_journeys import SPEED, Odometry, drive, hold
 from test_journeys import odometry as odometry
 from visits import DESKTOP, PHONE, Visit
 from waiting import eventually
@@ -60,12 +60,10 @@ def test_a_page_that_is_loaded_again_stays_signed_in(
         reload(visited, "nav")
     assert stored(page) == kept  # no token makes another one
     page.click("nav a:has-text('Drive')")
-    hold(page)
-    eventually(lambda: odometry.speed > SPEED, "it drives, by a login with the token")
+    drive(page, lambda: odometry.speed > SPEED)  # by a login with the token
     page.mouse.up()
     odometry.stands()
-    hold(page)  # the login after a release
-    eventually(lambda: odometry.speed > SPEED, "and again")
+    drive(page, lambda: odometry.speed > SPEED)  # the login after a release
     page.mouse.up()
     odometry.stands()
     for secret in (kept["token"], appliance.passwords["alice"]):
