@@ -18,7 +18,7 @@ from waiting import PATIENCE, eventually
 
 from appliance import certs
 from appliance.mdns.announcer import NAMES
-from appliance.ops.control import ask
+from appliance.ops.control import NotRunningError, ask
 from appliance.ops.init import initialise
 
 APPLIANCE = (sys.executable, "-m", "appliance")
@@ -85,7 +85,10 @@ class Robot:
     @property
     def name(self) -> str:
         """The name that it is announced by; empty while it is not."""
-        return str(self.status()["name"] or "") if self._control.exists() else ""
+        try:
+            return str(self.status()["name"] or "")
+        except NotRunningError:  # it starts
+            return ""
 
     def announced(self, *addresses: str) -> None:
         """Wait until it says that it is announced, with these addresses."""
