@@ -54,6 +54,9 @@ LOG_LINES = 100
 CONNECTION_LINES = 8
 LINE = 500
 
+#: How the problem begins of an attack that did not come so far that it was told of.
+NOT_REACHED = "no line of the log matches"
+
 #: Seconds that the healthy client is measured after the attack, whose end is a part of it.
 AFTERMATH = 0.3
 
@@ -144,7 +147,7 @@ class Server:
         lines = log.splitlines()
         matching_lines = sum(1 for line in lines if re.search(attack.log_pattern, line))
         if not matching_lines and took >= attack.logged_after:
-            problems.append(f"no line of the log matches {attack.log_pattern!r}")
+            problems.append(f"{NOT_REACHED} {attack.log_pattern!r}")
         allowed = LOG_LINES * (1 + took) + CONNECTION_LINES * counts["connections"]
         if len(lines) > allowed:
             problems.append(f"the log was flooded: {len(lines)} lines in {took:.1f} s")
