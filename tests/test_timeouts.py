@@ -36,7 +36,7 @@ def test_a_test_that_hangs_fails_and_the_next_runs(tmp_path: Path) -> None:
     file.write_text(HANGING)
     project = TESTS.parent / "pyproject.toml"
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-c", project, "-p", "conftest", "--timeout", "1", file],
+        [sys.executable, "-m", "pytest", "-c", project, "-p", "conftest", "--timeout", "4", file],
         env={**os.environ, "PYTHONPATH": str(TESTS)},
         capture_output=True,
         text=True,

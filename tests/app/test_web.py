@@ -48,9 +48,9 @@ async def test_it_is_well(web: WebApp, monkeypatch: pytest.MonkeyPatch):
 
 async def test_it_is_not_well(web: WebApp, monkeypatch: pytest.MonkeyPatch):
     """As the watchdog: what counts is work that is done, not that the loop answers."""
-    monkeypatch.setattr(watchdog, "TURN_PATIENCE", 0.05)
     pulse, scheduler = web.app._pulse, web.app._listeners.scheduler
     with monkeypatch.context() as stuck:
+        stuck.setattr(watchdog, "TURN_PATIENCE", 0.05)
         stuck.setattr(scheduler, "queue_turn", lambda member: None)
         status, _, body = await web.get("/healthz")
         assert (status, body) == (503, b"no message has gone through a turn\n")

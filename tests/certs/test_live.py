@@ -13,6 +13,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -352,7 +353,8 @@ def test_a_certificate_runs_out(tmp_path: Path, version: ssl.TLSVersion) -> None
     process = make(tmp_path, username_from="subject")
     company = Company()
     process.ca.write_bytes(process.ca.read_bytes() + company.pem())
-    company.issue(tmp_path / "certs/clients/short", "tablet", days=1 / 24)
+    elapsed = (datetime.now(timezone.utc) - NOW) / timedelta(days=1)  # NOW is when it was imported
+    company.issue(tmp_path / "certs/clients/short", "tablet", days=elapsed + 1 / 24)
     clock = WallClock(tmp_path / "clock")
     process.environment = clock.environment
     process.start()

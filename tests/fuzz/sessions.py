@@ -60,7 +60,7 @@ LIMITS = {
     "retained_bytes": "1 MiB",
     "sessions": 100,
     "packet_size": "1 MiB",
-    "connect_timeout": "2 s",
+    "connect_timeout": "20 s",
     "connections_per_address": 1000,
     "connection_rate": 100_000,
 }

@@ -79,8 +79,8 @@ def test_the_clock_is_set_while_it_runs(tmp_path: Path) -> None:
         taken = time.monotonic()
         will = Will(WILLS, b"gone", 1, properties={Property.WILL_DELAY_INTERVAL: 3})
         mortal = join("mortal", 5, will=will, **lasting(60))
-        mortal.kill()
         died = time.monotonic()
+        mortal.kill()
 
         wills: list[float] = []
 

@@ -115,7 +115,7 @@ class Browser:
 
         AssertionError says what was thrown.
         """
-        with connect(self._page(), max_size=None) as devtools:
+        with connect(self._page(), max_size=None, open_timeout=START_TIMEOUT) as devtools:
             number = next(self._numbers)
             parameters = {"expression": expression, "awaitPromise": True, "returnByValue": True}
             command = {"id": number, "method": "Runtime.evaluate", "params": parameters}

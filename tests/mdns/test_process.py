@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import psutil
 import pytest
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance.mdns import process as announcing
 from appliance.mdns.announcement import SECURE_MQTT, Announcement, Service
@@ -41,7 +41,7 @@ async def running(script: str, delay: float = 0.01) -> AsyncIterator[AnnouncerPr
         # before its pipes were connected.
         while not task.done():
             task.cancel()
-            await asyncio.wait({task}, timeout=1)
+            await asyncio.wait({task}, timeout=10)
 
 
 class Told:
@@ -65,7 +65,10 @@ def child() -> int:
     return int(file.read_text().strip() or 0) if file.exists() else 0
 
 
-async def test_it_is_told_and_says_what_it_does(told: Told) -> None:
+async def test_it_is_told_and_says_what_it_does(
+    told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(announcing, "FAREWELL", PATIENCE)
     async with running(GOOD) as process:
         assert process.status()["state"] == "off" and process.pid is None
         process.announce(WANTED)

@@ -517,8 +517,9 @@ async def test_a_take_over_by_the_network(harness: Harness, caplog):
 
 
 @both
-async def test_the_reason_reaches_who_is_still_sending(harness: Harness, tls):
+async def test_the_reason_reaches_who_is_still_sending(harness: Harness, tls, monkeypatch):
     """Closed with unread input, a connection is reset: the last packet would be lost."""
+    monkeypatch.setattr(lingering, "TIMEOUT", PATIENCE)
     await harness.start()
     peer = await harness.log_in("wrong", tls=tls)
     # Of small packets that may come, many are behind the one that may not.

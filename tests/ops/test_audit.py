@@ -22,7 +22,7 @@ from typing import Any
 import pytest
 from appliance_process import ApplianceProcess
 from raw_client import RawClient
-from waiting import eventually
+from waiting import PATIENCE, eventually
 
 from appliance.broker.session import Session
 from appliance.broker.values import Action, Identity, TlsInfo
@@ -33,6 +33,12 @@ from appliance.ops import audit as audit_module
 from appliance.ops.audit import Audit, AuditError, note
 
 WRONG = "a wrong password, never to be seen"
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its end waits for all that is to be written, on however slow a computer."""
+    monkeypatch.setattr(audit_module, "CLOSE_TIMEOUT", PATIENCE)
 
 
 def session_of(user: str | None, client_id: str) -> Session:

@@ -39,7 +39,7 @@ from rover_workspace import DRIVE, VALUE, build_workspace
 __all__ = ["isolated_domain"]  # a fixture
 
 pytestmark = [
-    pytest.mark.timeout(600),
+    pytest.mark.timeout(1800),
     pytest.mark.usefixtures("isolated_domain"),
 ]  # it may have to be built
 
@@ -71,7 +71,7 @@ def binary():
         env={**os.environ, "PYINSTALLER_ZLIB_COMPRESSION_LEVEL": "1"},  # its size is no matter here
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=1800,
     )
     assert built.returncode == 0, built.stderr[-4000:]
     return found
@@ -154,7 +154,7 @@ class Box(BrokerProcess):
 
     def listen(self, topic, *options):
         """mosquitto_sub, which prints what comes."""
-        command = [*self._mosquitto("sub"), "-W", "30", "-t", topic, *options]
+        command = [*self._mosquitto("sub"), "-W", "120", "-t", topic, *options]
         return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
     def _mosquitto(self, program):

@@ -920,8 +920,9 @@ async def test_slow_plugins_lose_events_and_delay_nothing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(events, "MAX_EVENTS", 40)  # half of which is lent to one user
-    async with running({**amqtt_users, own(Slow): {}}, plugin_timeout=SHORT) as rig:
+    async with running({**amqtt_users, own(Slow): {}}) as rig:
         bob = await rig.connect("bob:secret", "b1")
+        rig.frame._guard.timeout = SHORT
         await bob.subscribe([("a", 1)])
         for _ in range(50):
             await bob.publish("a", b"x", qos=1)
@@ -936,8 +937,9 @@ async def test_events_are_bounded_in_bytes(
     amqtt_users: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(events, "MAX_EVENT_BYTES", 2000)  # half of which is lent to one user
-    async with running({**amqtt_users, own(Slow): {}}, plugin_timeout=SHORT) as rig:
+    async with running({**amqtt_users, own(Slow): {}}) as rig:
         bob = await rig.connect("bob:secret", "b1")
+        rig.frame._guard.timeout = SHORT
         for _ in range(5):
             await bob.publish("a", bytes(400), qos=1)
         assert len(rig.frame.plugins_manager._fired_events) == 2
@@ -948,11 +950,12 @@ async def test_a_users_flood_leaves_the_events_of_others(
 ) -> None:
     monkeypatch.setattr(events, "MAX_EVENTS", 40)
     both = {own(Slow): {}, own(Recorder): {}}
-    async with running({**amqtt_users, **both}, plugin_timeout=SHORT) as rig:
+    async with running({**amqtt_users, **both}) as rig:
         eve = await rig.connect("eve:apple", "e1")
         await rig.frame.plugins_manager.wait_fired_events()
         Recorder.told.clear()
         await rig.connect("bob:secret", "b1")
+        rig.frame._guard.timeout = SHORT
         bob = rig.broker.sessions["b1"]
         for number in range(100):  # before a task of a handler has had its turn
             rig.broker.publish(Message(f"{number}", b"x", retain=True), bob)
@@ -980,8 +983,9 @@ async def test_the_events_of_a_message_are_counted_as_work(
     costs = {}
     for plugin in (Slow, Recorder, LifeCycle):
         plugins = {**amqtt_users, own(plugin): {}}
-        async with running(plugins, acl=acl, plugin_timeout=SHORT) as rig:
+        async with running(plugins, acl=acl) as rig:
             await rig.connect("bob:secret", "b1")
+            rig.frame._guard.timeout = SHORT
             bob = rig.broker.sessions["b1"]
             for retain in (False, True):
                 rig.broker.publish(Message(topic, b"x", retain=retain), bob)  # finds the route

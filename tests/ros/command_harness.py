@@ -6,6 +6,7 @@ import asyncio
 import math
 import struct
 import time
+from unittest import mock
 
 from bridge_harness import TWIST, Harness
 
@@ -97,6 +98,15 @@ class Wire:
     abort = close
 
 
+def moment():
+    """The loop's time, the same until it goes on: a pause of the test is none of its clients'."""
+    loop = asyncio.get_running_loop()
+    if not hasattr(loop, "moment_of_test"):
+        loop.moment_of_test = loop.time()
+        loop.call_soon(delattr, loop, "moment_of_test")
+    return loop.moment_of_test
+
+
 class Driver:
     """A client with a connection, as the network's clients have it."""
 
@@ -116,8 +126,7 @@ class Driver:
     def say(self, *packets, at=None):
         """Have these received, now or at another time of the loop's clock."""
         # As a connection does it, once for all that it has received.
-        now = asyncio.get_running_loop().time()
-        self.broker.accounting.now = now if at is None else at
+        self.broker.accounting.now = moment() if at is None else at
         self.client.receive(b"".join(packet.encode(self.version) for packet in packets))
         while self.wire.asks_for_turn:  # a conversion has taken its turn, on a busy computer
             self.wire.asks_for_turn = False
@@ -129,8 +138,10 @@ class Driver:
 
     def steer(self, payload=GO, qos=0, properties=None, **kw):
         """Say when it was made, so that it is known to be new."""
-        said = {**(properties or {}), Property.USER_PROPERTY: [("sent-at", str(time.time()))]}
-        self.drive(payload, qos, properties=said, **kw)
+        now = time.time()
+        said = {**(properties or {}), Property.USER_PROPERTY: [("sent-at", str(now))]}
+        with mock.patch("time.time", return_value=now):  # a pause of the test is none of its own
+            self.drive(payload, qos, properties=said, **kw)
 
     def leave(self):
         self.say(Disconnect())

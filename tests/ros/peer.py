@@ -111,7 +111,7 @@ class Peer:
     def ask(self, service, count):
         """Call a std_srvs/srv/SetBool so often in one go; each answer is told as received."""
         client = self.node.create_client(SetBool, service, qos_profile=QoSProfile(depth=count))
-        if not client.wait_for_service(10):
+        if not client.wait_for_service(60):
             raise TimeoutError(f"there is no {service}")
         for _ in range(count):
             future = client.call_async(SetBool.Request())

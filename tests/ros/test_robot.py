@@ -30,7 +30,7 @@ BRIDGE = {
     "topics": [{"ros": "/cmd_vel", "to": "ros", "type": "geometry_msgs/msg/Twist"}],
     "services": [
         "/turtle/*",
-        {"ros": "/turtle/think", "timeout": "3 s"},
+        {"ros": "/turtle/think", "timeout": "10 s"},
         "/turtle/absent",
         {
             "ros": "/turtle/ask_human",
@@ -143,7 +143,7 @@ def test_services_that_are_absent_silent_or_vanish(client_of, robot, version):
     )
     assert client.error(f"{TURTLE}/think/_call") == (
         "timeout",
-        "no answer from /turtle/think within 3 s",
+        "no answer from /turtle/think within 10 s",
     )
     code, message = client.error(f"{TURTLE}/pen/_call", {"data": "yes"})
     assert code == "bad_request" and message.startswith("data: expected true or false")
@@ -253,8 +253,8 @@ def test_several_goals_at_once_to_their_ends(client_of, version):
             for one in status
         }
 
-    eventually(lambda: ended().get(goals[6]) == "succeeded", "the status")
-    assert ended()[goals[99]] == "aborted"
+    expected = {goals[6]: "succeeded", goals[99]: "aborted"}
+    eventually(lambda: expected.items() <= ended().items(), "the status")
 
 
 @both
@@ -267,7 +267,7 @@ def test_a_goal_cancelled_half_way(client_of, robot, version):
     assert client.call(f"{WALK}/_cancel", {"goal_id": goal}) == {"goals_canceling": [goal]}
     result = client.next(f"{WALK}/_result/{goal}")
     assert result["status"] == "canceled"
-    assert 2 < len(result["result"]["sequence"]) < 100
+    assert 2 < len(result["result"]["sequence"]) < 302
     code, message = client.error(f"{WALK}/_cancel", {"goal_id": goal})
     assert (code, message) == ("unknown_goal", "the goal has ended already")
 

@@ -139,7 +139,7 @@ async def test_they_are_bounded(monkeypatch, caplog, name, value, said):
     monkeypatch.setattr(schema_topics, name, value)
     schemas = Schemas(load_description)
     schemas.topics.replace([STRING, TWIST])
-    await until(lambda: said in caplog.text, "the warning", 5)
+    await until(lambda: said in caplog.text, "the warning")
     assert schemas.names == {"std_msgs/String"}
     schemas.topics.replace([TWIST])
     assert schemas.names == set()

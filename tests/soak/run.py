@@ -149,8 +149,10 @@ class _Observer(Client):
     @property
     def complete(self) -> bool:
         """Whether `$SYS` was published twice, so that it counts itself."""
-        name = "retained messages/count"
-        return name in self.values and self.number(name) >= len(self.values)
+        name, own = "retained messages/count", ("clients/total", "subscriptions/count")
+        if not all(each in self.values for each in (name, *own)):
+            return False
+        return self.number(name) >= len(self.values) and all(self.number(each) for each in own)
 
     @property
     def waiting(self) -> int:
@@ -219,7 +221,7 @@ class Soak:
         if not await observer.connect(clean=True, will_qos=None):
             return
         observer.outbox.subscribe({f"{_SYS}#": 0})
-        await self._until(lambda: observer.complete, 10)
+        await self._until(lambda: observer.complete, 60)
         at_first = dict(observer.values)
         crowd = Crowd(
             seed=self.report.seed,
@@ -317,7 +319,7 @@ class Soak:
         def gone() -> bool:
             return all(observer.values[name] == at_first[name] for name in names)
 
-        if not await self._until(gone, 10):
+        if not await self._until(gone, 60):
             left = ", ".join(
                 f"{name} {observer.values[name]}, at first {at_first[name]}" for name in names
             )

@@ -30,6 +30,9 @@ ANSWER = b'{"ok": true}'
 #: Seconds for all answers, behind the last call.
 PATIENCE = 60.0
 
+#: Seconds until the link has to be up.
+CONNECTING = 60.0
+
 
 @dataclass
 class Report:
@@ -168,7 +171,7 @@ class Calls(Trial[Report]):
         robot = await self.dial("probe")
         await robot.subscribe(f"{HERE}cmd_vel")
         operator = await MqttClient.dial(port, "probe")
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + CONNECTING
         while not robot.messages:
             assert time.monotonic() < deadline, f"the link is not up:\n{self.device.log[-2000:]}"
             await operator.publish(f"{THERE}cmd_vel", b"{}")

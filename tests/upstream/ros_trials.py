@@ -57,7 +57,11 @@ class RosCommands(LateCommands):
         return ApplianceDevice(
             self.directory / "device",
             remote,
-            link={"version": self._version, "in": [dict(rule) for rule in IN[:2]]},
+            link={
+                "version": self._version,
+                "in": [dict(rule) for rule in IN[:2]],
+                "keep_alive": "60 s",
+            },
             bridge={"topics": [route]},
         )
 

@@ -23,13 +23,14 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from saboteur import Saboteur
-from waiting import until
+from waiting import PATIENCE, until
 
 from appliance.broker.accounts import Account
 from appliance.broker.faults import Faults
 from appliance.config.urls import ProxyUrl, ServerUrl, parse_server
 from appliance.mqtt.codec import V5
 from appliance.mqtt.packets import Connect, Publish
+from appliance.net import lingering
 from appliance.net.callbacks import Entries
 from appliance.net.layers import Schedulable, UpperLayer
 from appliance.upstream import dial as dial_module
@@ -763,8 +764,9 @@ async def test_a_close_that_the_broker_does_not_read_is_cut(site):
         stop.set()
 
 
-async def test_the_last_bytes_arrive_though_the_broker_sends(site):
+async def test_the_last_bytes_arrive_though_the_broker_sends(site, monkeypatch):
     """A DISCONNECT, or the broker would publish the will."""
+    monkeypatch.setattr(lingering, "TIMEOUT", PATIENCE)
     got = bytearray()
 
     def serve(connection: socket.socket) -> None:
@@ -772,6 +774,7 @@ async def test_the_last_bytes_arrive_though_the_broker_sends(site):
         while data := connection.recv(65536):
             got.extend(data)
             time.sleep(0.01)
+        connection.close()
 
     with Server(serve) as server:
         transport = await site.dial(f"mqtt://127.0.0.1:{server.port}")

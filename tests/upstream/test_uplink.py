@@ -314,7 +314,7 @@ async def test_a_poisonous_message_that_overtakes_another_one_blocks_nothing_eit
         fleet.acknowledge = close_at(*bad)
         await fleet.visited()
         await publish(rig, "r2d2/events/bad", b"poison")
-        await until(lambda: fleet.topics.count(bad[0]) == WITHOUT_PROGRESS + 1, "it sent alone")
+        await until(lambda: fleet.topics.count(bad[0]) > WITHOUT_PROGRESS, "it sent alone")
         await publish(rig, "r2d2/alarms/bad", b"poison")
         await publish(rig, "r2d2/alarms/good", b"1")
         await rig.drained()

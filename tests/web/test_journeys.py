@@ -204,12 +204,19 @@ def test_a_phone_that_is_turned_or_interrupted(
         page.wait_for_selector("dd:text-is('ready')")
         box = page.locator(".pad").bounding_box()
         at = {"x": box["x"] + 0.5 * box["width"], "y": box["y"] + 0.02 * box["height"]}
-        browser.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
-        eventually(lambda: odometry.speed > SPEED, "the robot drives")
-        page.wait_for_selector(".hint:text-is('Driving by touch')")  # the first may have been old
+
+        def press() -> None:
+            browser.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
+
+        press()
+        told = page.locator(".hint:text-is('Driving by touch')")  # the first may have been old
+        until_it_drives(page, lambda: odometry.speed > SPEED and told.count() > 0, press, cancel)
+
+    def cancel() -> None:
+        browser.send("Input.dispatchTouchEvent", {"type": "touchCancel", "touchPoints": []})
 
     touch()
-    browser.send("Input.dispatchTouchEvent", {"type": "touchCancel", "touchPoints": []})
+    cancel()
     odometry.stands()
     touch()
     size = page.viewport_size
@@ -241,18 +248,26 @@ def test_a_gamepad_drives_while_its_button_is_held(
     before = odometry.count
     eventually(lambda: odometry.count > before + 5, "odometry")
     assert odometry.speed == 0  # the stick alone moves nothing
-    page.evaluate("pad.buttons[5].pressed = true")
-    eventually(lambda: odometry.speed > SPEED, "the robot drives")
-    page.wait_for_selector(".hint:text-is('Driving by gamepad')")
+    told = page.locator(".hint:text-is('Driving by gamepad')")
+
+    def until_it_does(number: int) -> None:
+        def hold(is_held: bool) -> None:
+            pressed = f"pad.buttons[{number}].pressed = {json.dumps(is_held)}"
+            page.evaluate(f"{pressed}; new Promise(requestAnimationFrame)")
+
+        hold(True)
+        drives = lambda: odometry.speed > SPEED and told.count() > 0  # noqa: E731
+        until_it_drives(page, drives, partial(hold, True), partial(hold, False))
+
+    until_it_does(5)
     page.evaluate("pad.buttons[5].pressed = false")
     odometry.stands()
     page.wait_for_selector("dd:text-is('ready')")
-    page.evaluate("pad.buttons[4].pressed = true")
-    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    until_it_does(4)
     page.evaluate("pad.connected = false")  # its battery is empty, or its cable is out
     odometry.stands()
     page.evaluate("pad.connected = true")
-    eventually(lambda: odometry.speed > SPEED, "the robot drives")
+    until_it_does(4)
     page.evaluate("window.dispatchEvent(new Event('blur'))")
     odometry.stands()
     before = odometry.count

@@ -24,6 +24,7 @@ TF = compile_converter(describe(TFMessage, load_message))
 
 WALL = 2.0  # m, the x of the wall in the map
 SPEED = 0.8  # rad/s
+INTERVAL = 0.05  # s, between two transforms
 ODOM_X, ODOM_YAW = 0.5, 1.0  # where the frame odom is in the map
 MOUNTED_X, MOUNTED_YAW = 0.3, math.pi / 2  # where the scanner is on the robot
 RAYS = 360
@@ -42,12 +43,13 @@ class Robot(Node):
         placed = self.transform("map", "odom", ODOM_X, ODOM_YAW)
         self.static.publish(TF.from_dict({"transforms": [mounted, placed]}))
         self.map.publish(self.grid())
-        self.create_timer(0.05, self.move)
+        self.turned = 0.0
+        self.create_timer(INTERVAL, self.move)
         self.create_timer(0.2, self.look)
 
     def heading(self):
-        """Of the robot, in the frame odom."""
-        return SPEED * self.get_clock().now().nanoseconds / 1e9 % math.tau
+        """Of the robot, in the frame odom: a computer that stands still turns nothing meanwhile."""
+        return self.turned
 
     def transform(self, parent, child, x, yaw):
         stamp = self.get_clock().now().to_msg()
@@ -74,6 +76,7 @@ class Robot(Node):
         return found
 
     def move(self):
+        self.turned = (self.turned + SPEED * INTERVAL) % math.tau
         heading = self.heading()
         turned = self.transform("odom", "base_link", 0.0, heading)
         self.tf.publish(TF.from_dict({"transforms": [turned]}))

@@ -109,7 +109,7 @@ class Robot:
 
     def ask(self, service, value):
         """Call a SetBool."""
-        rospy.wait_for_service(service, 10)
+        rospy.wait_for_service(service, 60)
         answer = rospy.ServiceProxy(service, SetBool)(value)
         return [answer.success, answer.message]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import statistics
 import struct
 import threading
 import time
@@ -81,7 +82,10 @@ class Taker:
             if await arrives():
                 break
             await asyncio.sleep(0.05)
-        await asyncio.sleep(0.1)
+        # The topic is in order: behind this one no probe is on its way.
+        known = string("known")
+        await peer.do("publish", "/a", known.hex())
+        await until(lambda: self.taken and self.taken[-1][1].startswith(known), "the last probe")
         self.taken.clear()
         self.batches.clear()
 
@@ -233,7 +237,7 @@ async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, harnes
         last = time.time()
         await peer.do("publish_times", ros, 1, 1000)
         await until(lambda last=last: stamps[-1] >= last, "the last message")
-        oldest[keep] = max(ages)
+        oldest[keep] = statistics.median(ages)
     dropped = [status.dropped for status in harness.bridge.status()]
     # One second's worth in five and more: the queue grows to its end, on any computer.
     assert oldest["latest"] < oldest[2000] / 2
@@ -273,6 +277,9 @@ async def test_subscriptions_come_and_go_while_messages_come(harness, peer):
         harness.bridge.replace(routes)
         await until(lambda: len(harness.bridged()) == 2, "/a again")
         loops += 1
+        if publishing.done() and loops <= 3:  # a busy computer has made few
+            again = peer.do("publish", "/a", string("one").hex(), 4000, 2000)
+            publishing = asyncio.create_task(again)
     await publishing
     assert loops > 3
     assert open_files() == files

@@ -118,7 +118,7 @@ async def test_all_that_is_remapped_is_carried(harness, robot, peer):
     await until(lambda: alice.on(f"r2d2/walk/_result/{goal}"), "the result")
     (result,) = alice.payloads(f"r2d2/walk/_result/{goal}")
     assert result["result"]["sequence"] == [0, 1, 1, 2, 3]
-    assert alice.on(f"r2d2/walk/_feedback/{goal}")
+    await until(lambda: alice.on(f"r2d2/walk/_feedback/{goal}"), "feedback")
     await until(lambda: alice.on("r2d2/walk/_status"), "the status")
 
     await until(lambda: harness.retained("r2d2/its/_param/mode") == "calm", "the parameters")
