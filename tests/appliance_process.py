@@ -22,9 +22,10 @@ from typing import Any
 import yaml
 from waiting import PATIENCE
 
-from appliance import certs
+from appliance import certs, config
 from appliance.access import Passwords
 from appliance.bench.peers import free_ports as free_ports
+from appliance.ops.control import NotRunningError, ask
 from appliance.ops.init import Credentials, initialise
 
 ROBOT = "r2d2"
@@ -215,6 +216,13 @@ class ApplianceProcess(BrokerProcess):
             raise
         ports = re.findall(listening, self.log, re.MULTILINE)
         self.port, self.plain_port = map(int, ports[-2:])
+
+    def is_answering(self) -> bool:
+        """Whether it listens on its control socket, too, which comes last at its start."""
+        try:
+            return bool(ask(config.load_control(self.config).control, "status"))
+        except NotRunningError:
+            return False
 
 
 class MosquittoProcess(BrokerProcess):

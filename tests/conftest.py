@@ -19,9 +19,6 @@ from appliance_process import ACL, ROBOT, ApplianceProcess
 from hypothesis import settings
 from xdist.scheduler import LoadFileScheduling
 
-from appliance import config
-from appliance.ops.control import NotRunningError, ask
-
 # How long an example takes is the computer's matter.
 settings.register_profile("default", deadline=None)
 settings.load_profile("default")
@@ -180,16 +177,9 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AppliancePro
         tmp_path_factory.mktemp("appliance"), users={"bob": "bob's"}, acl=ACL
     )
     process.start()
-    waiting.eventually(lambda: _is_answering(process), "it listens on its control socket, too")
+    waiting.eventually(process.is_answering, "it listens on its control socket, too")
     yield process
     process.stop()
-
-
-def _is_answering(process: ApplianceProcess) -> bool:
-    try:
-        return bool(ask(config.load_control(process.config).control, "status"))
-    except NotRunningError:
-        return False
 
 
 @pytest.fixture

@@ -545,9 +545,6 @@ FIRST: dict[str, tuple[str, ...]] = {
 #: Work that does not end while the appliance runs.
 ENDLESS = frozenset(("app.task",))
 
-#: While these are reached, a login has 50 ms, of whomever.
-SHORT_LOGINS = frozenset(("connection.login_timeout", "http.timeout"))
-
 
 def reach(*names: str) -> Callable[[Reach], Reach]:
     def register(how: Reach) -> Reach:
@@ -1037,10 +1034,9 @@ async def _one(site: Site, saboteur: Saboteur, name: str) -> None:
     others, saboteur.others = saboteur.others, []
     assert not others, f"faults that nobody injected, after {name}:\n" + "\n".join(others)
     lost = sum(actor.losses for actor in site.actors) - losses
-    # One, as a rule; all of a host whose accepting paused; all that waited for the store when it
-    # failed, or logged in while the time for that was short.
-    is_for_all = name.startswith(("commit.", "store.")) or name in SHORT_LOGINS
-    assert lost <= 2 * (len(site.actors) if is_for_all else 6), lost
+    # One, as a rule; all that waited for the store when it failed; all of a host whose accepting
+    # paused.
+    assert lost <= 2 * (len(site.actors) if name.startswith(("commit.", "store.")) else 6), lost
 
 
 async def _strike(site: Site, saboteur: Saboteur, name: str, *, behind: bool, where: str) -> None:

@@ -6,7 +6,6 @@ import asyncio
 import fcntl
 import os
 import pty
-import re
 import struct
 import subprocess
 import sys
@@ -103,7 +102,7 @@ async def test_once_here_and_from_afar(
     try:
         await site.join("tablet\u202e", "viewer")
         code, text = await told("--once", "--config", config)
-        assert code == 0 and re.match(r"r2d2  up 0:0\d:\d\d", text)
+        assert code == 0 and text.startswith("r2d2  up 0:00:0")
         assert "there is no bridge (bridge.bus is none)" in text and "tablet\\u202e" in text
         code, text = await told("--once", "--user", "admin", *afar)
         assert code == 0 and "tablet\\u202e" in text

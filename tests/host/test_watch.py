@@ -8,12 +8,11 @@ import time
 from pathlib import Path
 
 import pytest
-from waiting import PATIENCE
 
 from appliance.host.watch import watch
 
 #: Seconds that a change may take to be told of, and none that are not told of.
-SOON = PATIENCE
+SOON = 5.0
 NEVER = 1.5
 
 

@@ -974,7 +974,7 @@ async def test_publishes_over_the_rate_are_read_later(harness: Harness, tls):
             await calm.send(Publish("b", b"", 1, packet_id=1))
             assert isinstance(await calm.receive(), Puback)
     # A second's worth may come at once.
-    assert 0.6 < loop.time() - began < PATIENCE
+    assert 0.6 < loop.time() - began < 6
 
 
 async def test_a_rate_holds_for_the_smallest_messages(harness: Harness):

@@ -245,6 +245,7 @@ def test_several_goals_at_once_to_their_ends(client_of, version):
     steps = [[0, 1, 1], [1, 1, 2], [1, 2, 3], [2, 3, 5], [3, 5, 8], [5, 8, 13]]
     every = [{"sequence": step} for step in steps]
     assert feedback == [step for step in every if step in feedback]
+    assert feedback[0] == every[0] and 3 <= len(feedback) <= 6
 
     def ended():
         return {
@@ -267,7 +268,7 @@ def test_a_goal_cancelled_half_way(client_of, robot, version):
     assert client.call(f"{WALK}/_cancel", {"goal_id": goal}) == {"goals_canceling": [goal]}
     result = client.next(f"{WALK}/_result/{goal}")
     assert result["status"] == "canceled"
-    assert 2 < len(result["result"]["sequence"]) < 302
+    assert 2 < len(result["result"]["sequence"]) < 100
     code, message = client.error(f"{WALK}/_cancel", {"goal_id": goal})
     assert (code, message) == ("unknown_goal", "the goal has ended already")
 

@@ -49,7 +49,7 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
 #: How much longer than 1.5 keep alives a link may be silent on a busy computer, in seconds.
-LENIENCE = 20.0
+LENIENCE = 2.0
 
 RST = struct.pack("ii", 1, 0)
 

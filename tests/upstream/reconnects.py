@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 from appliance_process import ApplianceProcess
-from waiting import until
+from waiting import eventually, until
 
 from upstream.client import MqttClient
 from upstream.device import ACL, LIMITS, LINK_USER, links
@@ -74,6 +74,7 @@ class Reconnects:
         try:
             self._write_links()
             self.process.start()
+            eventually(self.process.is_answering, "it listens on its control socket, too")
             asyncio.run(self._run())
         finally:
             self.process.stop()
@@ -110,10 +111,7 @@ class Reconnects:
 
         It is online when all that it has sent is acknowledged: its state as well.
         """
-        try:
-            found = links(self.process.config)
-        except AssertionError:  # it does not listen on its control socket yet
-            return []
+        found = links(self.process.config)
         now = time.monotonic()
         online = [each for each in found if each["connected"] and not each["inflight"]]
         return [now - each["since"] for each in online]

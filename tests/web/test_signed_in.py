@@ -20,7 +20,7 @@ from appliance.access import Passwords
 pytest.importorskip("rclpy")
 sync_api = pytest.importorskip("playwright.sync_api")
 
-BACK_WITHIN = 15.0  # seconds after the appliance listens again
+BACK_WITHIN = 5.0  # seconds after the appliance listens again
 STORED = "sessionStorage.getItem('console')"
 
 

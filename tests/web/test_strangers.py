@@ -127,7 +127,7 @@ def test_a_hundred_thousand_topics(
         page.wait_for_selector("[role=status]:has-text('1 topic')")
     page.click("text='other/0/many'")
     page.wait_for_selector("#inspected:has-text('other/0/many')")
-    assert page.evaluate("longest") < 20_000  # 100 on one core
+    assert page.evaluate("longest") < 5000  # 100 on one core
     page.click("nav a:has-text('Overview')")
     page.wait_for_selector("h1:has-text('Overview')")
 

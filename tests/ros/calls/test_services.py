@@ -542,7 +542,7 @@ async def test_ros_gets_the_routes_answer_when_mqtt_gives_none(harness):
     asker = Asker(harness)
     nobody = json.loads(NOBODY)
     asker.ask()  # nobody has subscribed: at once
-    await until(lambda: asker.responses == [nobody], "the first")
+    await until(lambda: asker.responses == [nobody], "the first", 1)
     client = harness.client("alice", "r2d2/ask/_request/+")
     asker.ask()  # no response
     await until(lambda: asker.responses == [nobody] * 2, "the second")

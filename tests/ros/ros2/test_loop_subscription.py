@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import statistics
 import struct
 import threading
 import time
@@ -237,7 +236,7 @@ async def test_a_loop_that_cannot_keep_up_carries_the_newest(monkeypatch, harnes
         last = time.time()
         await peer.do("publish_times", ros, 1, 1000)
         await until(lambda last=last: stamps[-1] >= last, "the last message")
-        oldest[keep] = statistics.median(ages)
+        oldest[keep] = max(ages)
     dropped = [status.dropped for status in harness.bridge.status()]
     # One second's worth in five and more: the queue grows to its end, on any computer.
     assert oldest["latest"] < oldest[2000] / 2

@@ -476,12 +476,12 @@ async def test_start_and_stop_at_any_moment():
         looks, failures = [], []
         started = time.monotonic()
         node.start(lambda looks=looks: looks.append(1), failures.append)
-        assert time.monotonic() - started < PATIENCE
+        assert time.monotonic() - started < 1
         await asyncio.sleep(wait)
         await asyncio.to_thread(node.stop)
         node.stop()
         assert failures == []
-        assert time.monotonic() - started < wait + PATIENCE
+        assert time.monotonic() - started < wait + 5
 
 
 async def test_an_exception_in_a_poll_ends_the_node_and_is_reported():
