@@ -33,6 +33,10 @@ STALLED = 130.0
 #: Seconds until the first message has come through.
 CONNECTING = 120.0
 
+#: Seconds after which mosquitto is started once more, of whose bridge nothing has come: it was seen
+#: to stay silent for all of CONNECTING. Nothing is owed before all streams flow.
+SILENT = 30.0
+
 FLEETS = ("mosquitto", "rabbitmq", "appliance", "ejabberd")
 Fleet = Literal["mosquitto", "rabbitmq", "appliance", "ejabberd"]
 
@@ -207,13 +211,25 @@ class Kills:
     async def _begin(self) -> None:
         await self._until(self.there_sink.subscribed.is_set, "the fleet's sink subscribes")
         await self._until(self.here_sink.subscribed.is_set, "the robot's sink subscribes")
-        for _, sink, topic in self.sources:
-            await self._until(lambda: sink.received.get(topic), f"{topic} arrives")  # noqa: B023
+        flow = asyncio.ensure_future(self._all_flow())
+        try:
+            if isinstance(self.device, BridgeDevice):
+                await asyncio.wait([flow], timeout=SILENT)
+                if not flow.done():
+                    self.say(f"nothing in {SILENT:g} s: {self._state()}")
+                    await asyncio.to_thread(self._restart_device)
+            await flow
+        finally:
+            flow.cancel()
         # What was published before the link had subscribed there was for nobody.
         self.first = {
             source.name: sink.received[topic][0].number for source, sink, topic in self.sources
         }
         self.say("all streams flow")
+
+    async def _all_flow(self) -> None:
+        for _, sink, topic in self.sources:
+            await self._until(lambda: sink.received.get(topic), f"{topic} arrives")  # noqa: B023
 
     async def _disturb(self) -> None:
         dice = self.random
@@ -317,10 +333,24 @@ class Kills:
         deadline = time.monotonic() + CONNECTING
         while not condition():
             if time.monotonic() > deadline:
-                raise AssertionError(
-                    f"not within {CONNECTING:g} s: {what}\n{self.device.log[-3000:]}"
-                )
+                raise AssertionError(f"not within {CONNECTING:g} s: {what}\n{self._state()}")
             await asyncio.sleep(0.005)
+
+    def _state(self) -> str:
+        """Who is connected, what has come, and what both brokers log."""
+        members = [f"{each.name}: {each.connected=}, {each.connects=}" for each in self.members]
+        streams = [
+            f"{source.name}: {source.sent} sent, {len(source.acknowledged)} acknowledged,"
+            f" {len(sink.numbers(topic))} received"
+            for source, sink, topic in self.sources
+        ]
+        logs = [
+            line
+            for broker in (self.device, self.fleet)
+            for line in broker.log.splitlines()[-200:]
+            if "Saving in-memory database" not in line
+        ]
+        return "\n".join([*members, *streams, *logs])
 
     def _add_up(self) -> None:
         report = self.report
