@@ -414,6 +414,19 @@ class Site:
 
         self.readers.append(asyncio.get_running_loop().create_task(read()))
 
+    async def stranger(self, kind: str) -> Any:
+        """The server's end of a connection on which nothing is sent."""
+        peer = await self.dial(kind)
+        self.hands.append(peer)
+        address = peer.writer.get_extra_info("sockname")
+
+        def ends() -> list[Any]:
+            there = [each for each in self.scheduler.connections if each._transport is not None]
+            return [e for e in there if e._transport.get_extra_info("peername") == address]
+
+        await until(ends, "the server's end of the connection")
+        return ends()[0]
+
     async def slow(self, kind: str = "plain") -> tuple[Peer, Any]:
         """One that has much to read, and does not."""
         peer, protocol = await self.victim(kind, receive_buffer=4096)
@@ -637,10 +650,10 @@ async def _checked(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("connection.login_timeout")
 async def _no_connect(site: Site, patch: pytest.MonkeyPatch) -> None:
+    stranger = await site.stranger("plain")
     with pytest.MonkeyPatch.context() as hurried:
         hurried.setattr(site.scheduler, "connect_timeout", 0.05)
-        site.hands.append(await site.dial())
-        await asyncio.sleep(0.1)
+        stranger.limit_login()  # it alone: another client may take its time
 
 
 @reach("connection.rested")
@@ -773,10 +786,7 @@ async def _browses_slowly(site: Site, patch: pytest.MonkeyPatch) -> None:
 
 @reach("http.timeout")
 async def _browses_no_more(site: Site, patch: pytest.MonkeyPatch) -> None:
-    with pytest.MonkeyPatch.context() as hurried:
-        hurried.setattr(site.scheduler, "connect_timeout", 0.05)
-        site.hands.append(await site.dial("web"))
-        await asyncio.sleep(0.1)
+    (await site.stranger("web"))._transport._limit(0.05)
 
 
 @reach("connection.wait")
