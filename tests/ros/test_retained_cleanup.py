@@ -52,7 +52,7 @@ async def test_at_a_reload(harness, caplog):
     harness.node.spin()
     await until(lambda: others(harness) == ["r2d2/camera/a"])
     assert harness.client.payloads("r2d2/map") == [b""], "who subscribes is told that it is gone"
-    assert "taken back: 1" in caplog.text
+    await until(lambda: "taken back: 1" in caplog.text, "the end of the sweep")
     harness.bridge.replace([to_mqtt("/camera/*", retain=False)])
     harness.node.spin()
     await until(lambda: others(harness) == [])
