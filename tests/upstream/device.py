@@ -210,6 +210,11 @@ class BridgeDevice(Device):
     def kill(self) -> None:
         self.process.kill()
 
+    def restart(self) -> None:
+        """End it so that it saves what it has, and start it again."""
+        self.process.stop()
+        self.start()
+
     def memory(self) -> int:
         return self.process.memory()
 

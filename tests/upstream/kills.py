@@ -33,8 +33,8 @@ STALLED = 130.0
 #: Seconds until the first message has come through.
 CONNECTING = 120.0
 
-#: Seconds after which mosquitto is started once more, of whose bridge nothing has come: it was seen
-#: to stay silent for all of CONNECTING. Nothing is owed before all streams flow.
+#: Seconds until mosquitto is started once more because its bridge does not begin: it was seen to
+#: stay silent for all of CONNECTING.
 SILENT = 30.0
 
 FLEETS = ("mosquitto", "rabbitmq", "appliance", "ejabberd")
@@ -211,25 +211,21 @@ class Kills:
     async def _begin(self) -> None:
         await self._until(self.there_sink.subscribed.is_set, "the fleet's sink subscribes")
         await self._until(self.here_sink.subscribed.is_set, "the robot's sink subscribes")
-        flow = asyncio.ensure_future(self._all_flow())
-        try:
-            if isinstance(self.device, BridgeDevice):
-                await asyncio.wait([flow], timeout=SILENT)
-                if not flow.done():
-                    self.say(f"nothing in {SILENT:g} s: {self._state()}")
-                    await asyncio.to_thread(self._restart_device)
-            await flow
-        finally:
-            flow.cancel()
+        if isinstance(self.device, BridgeDevice):
+            try:
+                await self._until(self._all_flow, "all streams flow", SILENT)
+            except AssertionError as error:
+                self.say(str(error))
+                await asyncio.to_thread(self.device.restart)
+        await self._until(self._all_flow, "all streams flow")
         # What was published before the link had subscribed there was for nobody.
         self.first = {
             source.name: sink.received[topic][0].number for source, sink, topic in self.sources
         }
         self.say("all streams flow")
 
-    async def _all_flow(self) -> None:
-        for _, sink, topic in self.sources:
-            await self._until(lambda: sink.received.get(topic), f"{topic} arrives")  # noqa: B023
+    def _all_flow(self) -> bool:
+        return all(sink.received.get(topic) for _, sink, topic in self.sources)
 
     async def _disturb(self) -> None:
         dice = self.random
@@ -329,16 +325,21 @@ class Kills:
     def _owed(self, source: Source) -> set[int]:
         return {each for each in source.acknowledged if each >= self.first[source.name]}
 
-    async def _until(self, condition: Callable[[], object], what: str) -> None:
-        deadline = time.monotonic() + CONNECTING
+    async def _until(
+        self, condition: Callable[[], object], what: str, patience: float = CONNECTING
+    ) -> None:
+        deadline = time.monotonic() + patience
         while not condition():
             if time.monotonic() > deadline:
-                raise AssertionError(f"not within {CONNECTING:g} s: {what}\n{self._state()}")
+                raise AssertionError(f"not within {patience:g} s: {what}\n{self._state()}")
             await asyncio.sleep(0.005)
 
     def _state(self) -> str:
         """Who is connected, what has come, and what both brokers log."""
-        members = [f"{each.name}: {each.connected=}, {each.connects=}" for each in self.members]
+        members = [
+            f"{each.name}: connected {each.connected}, {each.connects} times"
+            for each in self.members
+        ]
         streams = [
             f"{source.name}: {source.sent} sent, {len(source.acknowledged)} acknowledged,"
             f" {len(sink.numbers(topic))} received"
