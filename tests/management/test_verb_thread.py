@@ -120,9 +120,14 @@ def _threads() -> list[threading.Thread]:
 
 async def _held(thread: VerbThread) -> tuple[threading.Event, asyncio.Task[bool]]:
     """A work of user "a" that has begun, and what lets it go on."""
-    go_on = threading.Event()
-    held = asyncio.create_task(thread.run("a", go_on.wait))
-    await asyncio.sleep(0)
+    begun, go_on = threading.Event(), threading.Event()
+
+    def work() -> bool:
+        begun.set()
+        return go_on.wait(PATIENCE)
+
+    held = asyncio.create_task(thread.run("a", work))
+    await until(begun.is_set, "the work that is held")
     return go_on, held
 
 
@@ -151,8 +156,9 @@ async def test_work_whose_call_has_ended_is_left_out(thread: VerbThread):
     await asyncio.sleep(0)
     works[0].cancel()
     held.cancel()
-    await asyncio.wait({held})
-    # It is the turn of the second one, which does not know it yet.
+    await asyncio.sleep(0)
+    # It is the turn of the second one, which does not know it yet: it runs in the next step.
+    assert held.done() and not works[1].done()
     works[1].cancel()
     go_on.set()
     await asyncio.gather(*works, return_exceptions=True)
