@@ -715,7 +715,7 @@ class Backlog:
             queue.settle(part, index)
             self._check_emptied(queue)
             return None
-        if record.number in self._repeated:
+        if queue.name != HELD and record.number in self._repeated:
             self._repeated.remove(record.number)
             self._tally.restored -= 1
             self._tally.remove(queue, len(data))

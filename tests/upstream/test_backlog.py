@@ -1206,6 +1206,27 @@ def test_what_was_held_and_in_flight_is_sent_again_on_a_connection_that_takes_no
         link.backlog.rewind()
 
 
+@pytest.mark.parametrize("is_journalled", [False, True])
+def test_what_was_put_off_and_then_was_too_large_is_sent_where_it_fits(is_journalled: bool) -> None:
+    """It was stored by itself when the fleet had no room; what was so may be in a journal, too."""
+    link = Link()
+    link.offer("first")
+    link.offer("large")
+    first, large = link.take(2)
+    link.backlog.retry_later(large, link.backlogs.time)
+    if not is_journalled:
+        link.backlog.settle(first)
+    link.backlogs.commit()
+    link.restart()
+    entry = link.next()
+    assert entry is not None and entry.record.payload == b"large"
+    assert link.backlog.hold(entry, 10, link.backlogs.time)
+    link.backlog.rewind()
+    link.backlog.connected(1 << 20)
+    assert sorted(link.drain()) == ["first", "large"][not is_journalled :]
+    assert not link.dropped() and link.counts().waiting == 0
+
+
 @pytest.mark.parametrize("restarts", [False, True])
 def test_what_is_held_is_the_first_to_be_dropped(restarts: bool) -> None:
     """Of a rule of normal priority: what cannot be sent now goes before what can."""
