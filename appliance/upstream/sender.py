@@ -87,13 +87,14 @@ class Sender:
         #: Of the kind of broker, and of the present connection.
         self._of_kind = limits
         self._use(limits)
-        #: The oldest message in flight when the last connection ended, and of how many in a row
-        #: that was so.
-        self._stuck_on = -1
+        #: The oldest message in flight when the last connection ended, see `_mark`, and of how many
+        #: in a row that was so.
+        self._stuck_on: int | str = -1
         self._stuck = 0
-        #: The numbers of messages on one of which the broker may have closed, with how often it has
-        #: when the message was sent alone. While there are any, one message is sent at a time.
-        self._suspects: dict[int, int] = {}
+        #: Messages on one of which the broker may have closed, with how often it has when the
+        #: message was sent alone. While there are any, one message is sent at a time, and none with
+        #: QoS 0: the one that is in flight would be blamed for it.
+        self._suspects: dict[int | str, int] = {}
         #: Messages to be acknowledged until the rest of the suspects, which were dropped, is
         #: forgotten.
         self._patience = 0
@@ -182,7 +183,7 @@ class Sender:
                 return
             self._set_aside(entry, f"the fleet's broker does not take it: {why}")
             return
-        qos = min(entry.qos, self._qos)
+        qos = min(1 if self._suspects else entry.qos, self._qos)
         retain = record.retain and self._may_retain
         code = connection.publish(entry, topic, payload, qos, retain, properties)
         if code:
@@ -219,7 +220,7 @@ class Sender:
 
     def _clear(self, entry: Entry) -> None:
         """The broker has answered: it does not close the connection on this message."""
-        self._suspects.pop(entry.record.number, None)
+        self._suspects.pop(_mark(entry), None)
         self._patience -= 1
         if self._patience <= 0:
             self._suspects.clear()
@@ -230,31 +231,31 @@ class Sender:
         It `was_settled` if the broker had answered all else that it was sent at the beginning.
         Returns whether one of them may be the reason: it is not the first connection to end on it.
         """
-        numbers = [entry.record.number for entry in inflight if entry is not None]
-        first = next((entry for entry in inflight if entry is not None), None)
-        if first is not None and was_settled and _may_be_poison(ending):
-            self._suspect(first, numbers, ending)
+        ours = [entry for entry in inflight if entry is not None]
+        if ours and was_settled and _may_be_poison(ending):
+            self._suspect(ours, ending)
         self._backlog.rewind()
-        return first is not None and (bool(self._suspects) or self._stuck >= WITHOUT_PROGRESS)
+        return bool(ours) and (bool(self._suspects) or self._stuck >= WITHOUT_PROGRESS)
 
-    def _suspect(self, first: Entry, numbers: list[int], ending: Ending) -> None:
-        """The broker has closed the connection: perhaps because of one of the messages."""
-        number = numbers[0]
+    def _suspect(self, inflight: list[Entry], ending: Ending) -> None:
+        """The broker has closed the connection: perhaps because of one of these messages."""
+        first = inflight[0]
+        mark = _mark(first)
         if self._suspects:
-            closed = self._suspects[number] = self._suspects.get(number, 0) + 1
+            closed = self._suspects[mark] = self._suspects.get(mark, 0) + 1
             if closed >= CLOSED_ON:
-                del self._suspects[number]
+                del self._suspects[mark]
                 self._set_aside(
                     first,
                     f"the connection has ended {CLOSED_ON} times when the fleet's broker was sent "
                     f"this message alone; the last time: {ending.text}",
                 )
             return
-        self._stuck = self._stuck + 1 if self._stuck_on == number else 1
-        self._stuck_on = number
+        self._stuck = self._stuck + 1 if self._stuck_on == mark else 1
+        self._stuck_on = mark
         if self._stuck >= WITHOUT_PROGRESS:
-            self._suspects = dict.fromkeys(numbers, 0)
-            self._patience = len(numbers) + PATIENCE
+            self._suspects = {_mark(entry): 0 for entry in inflight}
+            self._patience = len(inflight) + PATIENCE
 
     def _set_aside(self, entry: Entry, reason: str) -> None:
         now = self._clock()
@@ -268,6 +269,13 @@ class Sender:
             reason,
         )
         self._backlog.set_aside(entry, reason, now)
+
+
+def _mark(entry: Entry) -> int | str:
+    """By what a message is known on the next connection: its number, or its topic where a newer one
+    takes its place."""
+    is_itself = entry.part is not None or (entry.key is not None and entry.topic is None)
+    return entry.record.number if is_itself else entry.record.topic
 
 
 def _may_be_poison(ending: Ending) -> bool:
