@@ -198,6 +198,8 @@ def state_advice(code: int, settings: UpstreamSettings) -> str:
     what = "the fleet does not see that the robot is online"
     if code == ReasonCode.NOT_AUTHORIZED:
         return f"{what}: the access rules there have to let {_who(settings)} write it (prefix)"
+    if code == ReasonCode.PACKET_TOO_LARGE:
+        return f"{what}: the fleet's broker has to take larger packets"
     return f"{what}: {_ITS_LOG}"
 
 

@@ -93,8 +93,11 @@ class StateReport:
         # With QoS 0 where the window has no room: before the end, nothing else will follow.
         qos = min(1, granted.maximum_qos, connection.room)
         retain = granted.retain and limits.retain
-        connection.publish(None, self._topic, self.payload(presence), qos, retain)
-        if not qos:
+        code = connection.publish(None, self._topic, self.payload(presence), qos, retain)
+        if code:
+            what = f"the fleet's broker cannot be sent {quote(self._topic)}: {reason_words(code)}"
+            self._refuse(what, code)
+        if code or not qos:
             self.is_settled = True
 
     def acknowledged(self, server: int, code: int, now: float) -> None:

@@ -26,7 +26,7 @@ from typing import Literal
 from harness import abort
 from waiting import until
 
-from appliance.mqtt.codec import V5, V311, Properties, Property, decode_varint
+from appliance.mqtt.codec import V5, V311, PacketType, Properties, Property, decode_varint
 from appliance.mqtt.packets import (
     Connack,
     Connect,
@@ -186,7 +186,8 @@ class Visit:
         body = await self.reader.readexactly(length)
         self.heard = time.monotonic()
         most = self.fleet.limits.get(Property.MAXIMUM_PACKET_SIZE)
-        if self.version == V5 and isinstance(most, int) and len(head) + length > most:
+        is_told = head[0] >> 4 != PacketType.CONNECT  # which CONNACK comes after
+        if is_told and self.version == V5 and isinstance(most, int) and len(head) + length > most:
             self.fault(f"a packet of {len(head) + length} bytes, and {most} are allowed")
         packet = decode_packet(head[0], body, self.version)
         self.fleet.packets.append(packet)
