@@ -20,6 +20,9 @@ RELEASED: Final = datetime(2026, 1, 1, tzinfo=timezone.utc)
 #: A change of the wall clock by less than these seconds between two looks is NTP's, not a step.
 NUDGE: Final = 2.0
 
+#: Less than this, in seconds, is no sleep: the two clocks that tell it are read one by one.
+SHORTEST_SLEEP: Final = 0.01
+
 #: The half-life in seconds of the load that a `SpareClock` has seen; the seconds that a thread
 #: waits for the processor at each turn on an idle computer; and the least share of the processor
 #: that is assumed for other programs.
@@ -46,6 +49,27 @@ class StepWatch:
         ahead = self._wall() - now
         step, self._ahead = ahead - self._ahead, ahead
         return step if abs(step) >= NUDGE else 0.0
+
+
+class SleepWatch:
+    """Counts the seconds in which the computer slept: the monotonic clock stands still in sleep."""
+
+    def __init__(self) -> None:
+        self._first = self._slept = _asleep()
+
+    def seconds(self) -> float:
+        """Seconds of sleep since this was made; the same number until there was more."""
+        slept = _asleep()
+        if slept > self._slept + SHORTEST_SLEEP:
+            self._slept = slept
+        return self._slept - self._first
+
+
+def _asleep() -> float:
+    """Seconds of sleep since the computer was started, or less."""
+    # In this order a thread that loses the processor in between sees no sleep.
+    started = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return started - time.monotonic()
 
 
 class SpareClock:

@@ -15,6 +15,7 @@ from typing import Final, Protocol
 
 from appliance.broker.broker import Broker
 from appliance.broker.link import PeerStatus
+from appliance.host.clock import SleepWatch
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries
@@ -40,8 +41,8 @@ CHECK_INTERVAL: Final = 1.0
 #: a message, and what it looks for takes seconds.
 CHECKED_FOR: Final = 0.05
 
-#: Bytes that are written and not sent from which on nothing more is read: answers to what was read,
-#: as of messages no more than a few packets are written at a time.
+#: Bytes of answers that are written and not sent, from which on nothing more is read. Messages do
+#: not count: while a large one leaves slowly, what comes is read.
 MOST_UNSENT: Final = 1 << 20
 
 #: The shortest interval of PINGREQs for commands, in seconds, whatever `late` says.
@@ -115,6 +116,11 @@ class Channel:
         self._transport: UpstreamTransport | None = None
         self._ping_interval = math.inf if late is None else max(late / 2, SHORTEST_PING)
         self._received_at = -math.inf
+        self._sleep = SleepWatch()
+        self._slept = 0.0
+        #: Bytes that were written since the last message: all of them answers. Messages are written
+        #: only when little is unsent, so that hardly any answers lie before that one.
+        self._written_since = 0
         #: Why nothing is read now; empty while it is.
         self._holds: set[str] = set()
         self._timer: asyncio.TimerHandle | None = None
@@ -157,13 +163,16 @@ class Channel:
         if self._has_ended:
             return False
         self._received_at = now = self._loop.time()
+        self._look_for_sleep(now)
         for event in self.connection.receive(data, now):
             self._handle(event, now)
             if self._has_ended:
                 return False
         self._after(now)
-        if self._transport is not None and self._transport.unsent > MOST_UNSENT:
-            self._hold("unsent")  # it asks for answers that it does not read
+        if self._written_since > MOST_UNSENT and not self._has_ended:
+            assert self._transport is not None
+            if self._transport.unsent > MOST_UNSENT:
+                self._hold("unsent")  # it asks for answers that it does not read
         return False
 
     def proceed(self) -> bool:
@@ -203,6 +212,15 @@ class Channel:
         """There may be more to send, and room for it."""
         if not self._has_ended:
             self._after(self._loop.time())
+
+    def _look_for_sleep(self, now: float) -> None:
+        """Forget how old is what came and what comes now, if the computer has slept since."""
+        slept = self._sleep.seconds()
+        if slept != self._slept:
+            self._slept = slept
+            self.connection.woke(now)
+            if self.inward is not None:
+                self.inward.woke()
 
     # --- what comes -------------------------------------------------------------------------------
 
@@ -259,16 +277,21 @@ class Channel:
     def _after(self, now: float) -> None:
         """At the end of a round: commit, send on, write, and look at the times again."""
         self._broker.flush()
+        before = self.connection.waiting
         if self.connection.ended is None:
             self._owner.send_more(self)
-            if self._leaving and not self._is_under_way():
-                self.connection.close(ReasonCode.SUCCESS, self._leaving)
+        has_sent = self.connection.waiting > before
+        if self._leaving and self.connection.ended is None and not self._is_under_way():
+            self.connection.close(ReasonCode.SUCCESS, self._leaving)
         self.write(now)
+        if has_sent:
+            self._written_since = 0
 
     def write(self, now: float) -> None:
         """Write what the connection has collected; end if it has ended."""
         if self._has_ended or self._transport is None:
             return
+        self._written_since += self.connection.waiting
         chunks = self.connection.take(now)
         if chunks:
             self._transport.write(chunks)
@@ -284,9 +307,7 @@ class Channel:
         if self._timer is not None and now < self._checked_at + CHECKED_FOR:
             return
         self._checked_at = now
-        due = self.connection.tick(
-            now, self._transport.unsent, is_reading="receivers" not in self._holds
-        )
+        due = self.connection.tick(now, self._transport.unsent, is_reading=not self._holds)
         if self.connection.ended is not None:
             self._finish()
             return
@@ -379,6 +400,7 @@ class Channel:
         if self._has_ended:
             return
         now = self._loop.time()
+        self._look_for_sleep(now)
         if self.inward is not None:
             self.inward.take_turn(now)
         if not self._has_ended:

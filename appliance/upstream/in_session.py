@@ -14,6 +14,7 @@ waits, the connection is not read; what comes all the same is refused (0x97).
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, Protocol
@@ -59,6 +60,9 @@ LOOK_INTERVAL: Final = 0.25
 
 #: The cost of decoding the properties of a request to change its Response Topic.
 REQUEST_COST: Final = 5
+
+#: The cost of what is done with a topic: one for each 64 characters of it.
+TOPIC_SHIFT: Final = 6
 
 #: The reason codes that a client may put into PUBACK (5.0 section 3.4.2.1); 0x10 is a server's.
 _OF_CLIENTS: Final = frozenset((0x00, 0x80, 0x83, 0x87, 0x90, 0x91, 0x97, 0x99))
@@ -175,6 +179,9 @@ class InSession:
         self._undecided_since: float | None = None
         self._allowance = PublisherAllowance()
         self._readiness = readiness
+        #: The most levels that a topic there may have beside those that one here may.
+        prefixes = [settings.answers_there, *(rule.remote_prefix for rule in settings.inward)]
+        self._prefixed = max(prefix.count("/") for prefix in prefixes)
 
     def __str__(self) -> str:
         return str(self._session)
@@ -249,6 +256,11 @@ class InSession:
             self._is_paused = False
             self._connection.resume_reading()
 
+    def woke(self) -> None:
+        """The computer has slept: what waits is of unknown age."""
+        for came in self._waiting:
+            came.packet.not_before = -math.inf
+
     def proceed(self) -> None:
         """Waiting: a receiver that the first message waits for has room again."""
         self._connection.later(0)
@@ -284,6 +296,11 @@ class InSession:
         if came.is_refused:
             reason = "too much waits for its receivers here"
             self._refuse(packet, ReasonCode.QUOTA_EXCEEDED, reason)
+            return True
+        # It is split and checked again at each step, and an alias of two bytes may stand for it.
+        self._broker.counters.cost += len(packet.topic) >> TOPIC_SHIFT
+        if packet.topic.count("/") >= self._broker.limits.topic_levels + self._prefixed:
+            self._refuse(packet, ReasonCode.TOPIC_NAME_INVALID, "its topic has too many levels")
             return True
         answers_there = self._settings.answers_there
         if packet.topic.startswith(answers_there) or "/_reply/" in packet.topic:

@@ -7,7 +7,8 @@ PINGREQ, if it left the server at once when it was published, and that is not so
 - a message of QoS 1 that waits there because too many are unacknowledged (`LEAST_WINDOW`): an
   answered PINGREQ tells its age only if so many cannot have been, see `Freshness`;
 - a retained message, a message that is sent again (DUP), and what a session there has kept while
-  the link was down: these are of unknown age.
+  the link was down: these are of unknown age;
+- what comes after this computer has slept, up to the answer to a PINGREQ that it sends then.
 
 A PINGREQ every `late`/2 is enough for a limit of `late`. What a client of the fleet itself holds
 back before the fleet's broker has it cannot be seen here.
@@ -87,10 +88,18 @@ class Freshness:
         #: Messages of QoS 1 that were received, and how many of these are not acknowledged.
         self._received = 0
         self._unacknowledged = 0
+        #: What was sent before this time tells nothing: the computer has slept since.
+        self._awake_since = -math.inf
 
     def session_began(self, asked_at: float) -> None:
         """The broker has made a new session, for a CONNECT of that time: nothing waits in it."""
-        self._left_after = self._sent_after = asked_at
+        if asked_at >= self._awake_since:
+            self._left_after = self._sent_after = asked_at
+
+    def woke(self, now: float) -> None:
+        """The computer has slept, and the clock stood still: nothing is known any more."""
+        self._awake_since = now
+        self._left_after = self._sent_after = -math.inf
 
     def ping_sent(self) -> None:
         """A PINGREQ goes out, behind all acknowledgements so far."""
@@ -99,6 +108,8 @@ class Freshness:
     def ping_answered(self, sent_at: float) -> None:
         """The PINGRESP to the oldest unanswered PINGREQ has come, which was sent at that time."""
         ping = self._pings.popleft()
+        if sent_at < self._awake_since:
+            return
         self._left_after = sent_at
         # So many can have been in flight at most when the broker answered it. If that is less than
         # its window, no message waited for the acknowledgement of another one then.

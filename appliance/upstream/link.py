@@ -353,6 +353,11 @@ class FleetConnection(Generic[T]):
             self._freshness.ping_sent()
             self._send(_PINGREQ)
 
+    def woke(self, now: float) -> None:
+        """The computer has slept: until a new PINGREQ is answered, all that comes may be old."""
+        self._freshness.woke(now)
+        self.ping()
+
     def answer(self, data: bytes | None) -> None:
         """Answer `Challenged` (5.0 section 4.12) [MQTT-4.12.0-3]."""
         self._authenticate(ReasonCode.CONTINUE_AUTHENTICATION, data)

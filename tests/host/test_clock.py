@@ -7,12 +7,14 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import pytest
 from appliance_process import ROBOT, ApplianceProcess
 from raw_client import RawClient
 from waiting import PATIENCE, eventually
 from wall_clock import HOUR, YEAR, WallClock
 
-from appliance.host.clock import RELEASED, StepWatch, is_unset
+from appliance.host import clock
+from appliance.host.clock import RELEASED, SHORTEST_SLEEP, SleepWatch, StepWatch, is_unset
 from appliance.mqtt.codec import Properties, Property
 from appliance.mqtt.packets import (
     Connack,
@@ -142,3 +144,24 @@ def test_a_step_is_told_from_a_nudge() -> None:
 def test_a_clock_that_was_never_set() -> None:
     assert is_unset(RELEASED - timedelta(seconds=1)) and not is_unset(RELEASED)
     assert not is_unset()
+
+
+def test_sleep_is_what_the_monotonic_clock_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = [50.0]
+    monkeypatch.setattr(clock.time, "clock_gettime", lambda which: started[0])
+    monkeypatch.setattr(clock.time, "monotonic", lambda: 30.0)
+    watch = SleepWatch()
+    assert watch.seconds() == 0
+    # Between its two readings of the clocks the thread may have lost the processor.
+    for step in (-5.0, SHORTEST_SLEEP / 2, 0.0):
+        started[0] = 50.0 + step
+        assert watch.seconds() == 0
+    started[0] = 70.0
+    assert watch.seconds() == 20
+    started[0] = 65.0
+    assert watch.seconds() == 20
+
+
+def test_no_sleep_is_seen_while_the_computer_is_awake() -> None:
+    watch = SleepWatch()
+    assert not any(watch.seconds() for _ in range(20_000))

@@ -8,6 +8,8 @@ import pytest
 from broker.conftest import FakeStore, Peer, lasting
 from waiting import until
 
+from appliance.broker.client import PACKET_COST
+from appliance.broker.counters import COST_PER_TURN
 from appliance.broker.limits import Features, Limits
 from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
@@ -18,7 +20,8 @@ from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.store import SqliteStore
 from appliance.upstream import in_session
-from appliance.upstream.late import LEAST_WINDOW
+from appliance.upstream.late import LEAST_WINDOW, Verdict
+from appliance.upstream.rules import LinkRules
 
 from .local_rig import ACL, Fleet, Rig, user_properties
 
@@ -494,6 +497,51 @@ def test_bytes_that_wait_are_limited_as_well(small: Rig, monkeypatch: pytest.Mon
     fleet.session.detach()
     assert rig.broker.accounting.input_bytes == 0
     reader.drain()  # wakes nobody
+
+
+@pytest.mark.parametrize("topic", ["fleet/r2/mission/" + "/" * 60_000, "fleet/" + "x" * 60_000])
+def test_a_long_topic_costs_what_it_takes(rig: Rig, topic: str) -> None:
+    """An alias of two bytes may stand for it: a portion of 2 KiB has some 250 of them."""
+    fleet = rig.connect()
+    counters = rig.broker.counters
+    before = counters.cost
+    for _ in range(250):
+        fleet.put(topic, qos=0)
+    assert counters.cost - before < 250 * PACKET_COST + 2 * COST_PER_TURN
+    assert fleet.session.waiting > 100  # what is more than may wait is refused
+    while fleet.connection.turn_in is not None:
+        before = counters.cost
+        fleet.turn()
+        assert counters.cost - before < 2 * COST_PER_TURN
+    assert rig.counters.received == 250 == rig.counters.refused + rig.counters.uncarried
+
+
+@pytest.mark.patches
+def test_a_topic_with_too_many_levels_is_looked_at_no_further(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To split 60,000 levels takes a millisecond each time."""
+    fleet = rig.connect()
+    searched: list[str] = []
+    monkeypatch.setattr(LinkRules, "inward", lambda _, topic: searched.append(topic))
+    most = rig.broker.limits.topic_levels
+    refused = fleet.send("fleet/r2/mission/" + "/" * most)
+    assert refused == ReasonCode.TOPIC_NAME_INVALID and not searched
+    assert fleet.send("fleet/r2/mission" + "/x" * (most - 1)) == 0
+    assert len(searched) == 1
+
+
+def test_what_waits_while_the_computer_sleeps_is_of_unknown_age(small: Rig) -> None:
+    rig = small
+    reader, fleet, _ = crowded(rig)
+    fleet.put("fleet/r2/calls/1", b"before")
+    assert fleet.session.waiting
+    fleet.session.woke()
+    reader.drain()
+    while fleet.connection.turn_in is not None:
+        fleet.turn()
+    assert b"before" not in reader.payloads()
+    assert rig.counters.dropped["fleet/r2/calls/#", Verdict.LATE] == 1
 
 
 def test_a_flood_takes_several_turns(rig: Rig) -> None:

@@ -75,6 +75,21 @@ def test_nothing_that_is_taken_is_older_than_the_rule_allows(
         assert age <= late
 
 
+def test_what_was_sent_before_a_sleep_tells_nothing() -> None:
+    """The clock stands still in sleep: what the fleet held meanwhile looks as if it were new."""
+    freshness = Freshness()
+    freshness.session_began(1.0)
+    freshness.ping_sent()
+    freshness.woke(2.0)
+    assert freshness.left_after(0) == freshness.left_after(1) == -math.inf
+    freshness.ping_answered(1.5)  # the one that was under way
+    freshness.session_began(1.9)
+    assert freshness.left_after(0) == freshness.left_after(1) == -math.inf
+    freshness.ping_sent()
+    freshness.ping_answered(2.0)
+    assert freshness.left_after(0) == freshness.left_after(1) == 2.0
+
+
 def test_an_answered_ping_tells_the_age_of_what_comes_after_it() -> None:
     freshness = Freshness()
     assert freshness.left_after(0) == freshness.left_after(1) == -math.inf

@@ -15,10 +15,12 @@ from waiting import until
 
 from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
+from appliance.host import clock
 from appliance.mqtt.codec import V311, Property
 from appliance.mqtt.packets import (
     Connack,
     Disconnect,
+    Pingresp,
     Puback,
     Publish,
     Suback,
@@ -33,6 +35,7 @@ from appliance.upstream.sender import WITHOUT_PROGRESS
 from appliance.upstream.status import warnings_of
 from upstream.fake_fleet import FakeFleet, Visit, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
+from upstream.relay import Relay
 from upstream.uplink_rig import Rig, hurry, running
 from upstream.uplink_rig import event_loop_policy as event_loop_policy
 
@@ -172,6 +175,21 @@ async def test_a_fleet_that_closes_behind_a_refused_state_has_no_other_client(
         assert "another client" not in str(rig.status().problem)
 
 
+async def test_a_fleet_that_takes_only_smaller_packets_than_the_state_gets_the_rest(
+    tmp_path: Path,
+) -> None:
+    profile = {"vda5050": {"manufacturer": "acme", "version": "3.0"}}
+    there = "vda5050/v3/acme/r2d2/"
+    async with FakeFleet(limits={Property.MAXIMUM_PACKET_SIZE: 150}) as fleet:
+        rig = Rig(tmp_path, fleet.port, profile=profile, out=[], **{"in": []})
+        async with running(rig):
+            await publish(rig, "r2d2/vda5050/factsheet", b"{}")
+            await until(lambda: f"{there}factsheet" in fleet.topics, "what is smaller")
+            refusal = rig.status().state_refusal
+            assert refusal is not None and "has to take larger packets" in refusal
+            assert f"{there}connection" not in fleet.topics and not fleet.faults
+
+
 async def test_a_link_by_vda5050_says_so_in_its_messages(tmp_path: Path) -> None:
     profile = {"vda5050": {"manufacturer": "acme", "version": "3.0"}}
     there = "vda5050/v3/acme/r2d2/"
@@ -220,6 +238,34 @@ async def test_a_message_from_there_is_published_here_and_then_acknowledged(
         await until(lambda: (packet_id, 0) in visit.acknowledged, "PUBACK to the fleet")
         assert rig.status().came == {"fleet/r2d2/cmd/#": 1}
         peer.hang_up()
+
+
+@pytest.mark.patches
+async def test_what_the_fleet_held_while_the_computer_slept_is_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until the fleet answers a PINGREQ that was sent after the sleep."""
+    slept = [0.0]
+    monkeypatch.setattr(clock, "_asleep", lambda: slept[0])
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        visit = await fleet.visited()
+        await rig.connected()
+        robot = await rig.client("robot")
+        await robot.send(Subscribe(1, [Subscription("r2d2/cmd/#", 0)]))
+        assert isinstance(await robot.receive(), Suback)
+        visit.send(Publish("fleet/r2d2/cmd/go", b"before", 0))
+        assert (await robot.receive()).payload == b"before"
+        asked: list[Visit] = []
+        fleet.pong = asked.append
+        slept[0] += 20
+        visit.send(Publish("fleet/r2d2/cmd/go", b"old", 0))
+        await until(lambda: asked, "a PINGREQ at once")
+        await until(lambda: rig.status().dropped.get("fleet/r2d2/cmd/#") == {"late": 1})
+        for each in asked:
+            each.send(Pingresp())
+        visit.send(Publish("fleet/r2d2/cmd/go", b"new", 0))
+        assert (await robot.receive()).payload == b"new"
+        robot.hang_up()
 
 
 async def test_a_request_from_there_is_answered_at_its_own_topic(tmp_path: Path) -> None:
@@ -320,6 +366,89 @@ async def test_a_poisonous_message_that_overtakes_another_one_blocks_nothing_eit
         await rig.drained()
         assert payloads(fleet, "fleet/r2d2/alarms/good") == [b"1"]
         assert {each["topic"] for each in rig.uplink.aside()} == set(bad)
+
+
+async def test_whoever_is_in_flight_is_not_blamed_for_a_message_with_qos_0(tmp_path: Path) -> None:
+    """The fleet closes upon a topic with QoS 0, whose newest value waits at each connection."""
+    rules = [{"topic": "events/#"}, {"topic": "state/#", "keep": "latest", "qos": 0}]
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port, out=rules)) as rig:
+        await fleet.visited()
+        await rig.connected()
+        fleet.acknowledge = close_at("fleet/r2d2/state/odom")
+        peer = await rig.client("odometry")
+        sent = [b"%d" % number for number in range(30)]
+
+        async def drive() -> None:
+            while True:
+                await peer.send(Publish("r2d2/state/odom", b"x", 0))
+                await asyncio.sleep(0.005)
+
+        driving = asyncio.create_task(drive())
+        await publish(rig, "r2d2/events/door", *sent)
+        bad = {"fleet/r2d2/state/odom"}
+        await until(lambda: {each["topic"] for each in rig.uplink.aside()} >= bad, "it to be told")
+        driving.cancel()
+        peer.hang_up()
+        await rig.drained()
+        assert {each["topic"] for each in rig.uplink.aside()} == bad
+        assert set(payloads(fleet, "fleet/r2d2/events/door")) == set(sent)
+
+
+async def test_while_a_large_message_leaves_slowly_the_link_is_read(tmp_path: Path) -> None:
+    """Or it would end for want of answers that it does not read, and begin the message again."""
+    rules = [{"topic": "cmd/#", "late": "500 ms"}, {"topic": "mission/#", "late": "10 s"}]
+    async with FakeFleet() as fleet, Relay(fleet.port) as relay:
+        rig = Rig(tmp_path, relay.port, keep_alive="2 s", **{"in": rules})
+        async with running(rig):
+            visit = await fleet.visited()
+            await rig.connected()
+            robot = await rig.client("robot")
+            await robot.send(Subscribe(1, [Subscription("r2d2/mission/#", 0)]))
+            assert isinstance(await robot.receive(), Suback)
+            relay.set(delay=0.2)
+            await until(lambda: (rig.status().round_trip or 0) > 0.4, "a PINGREQ under way")
+            relay.set("up", rate=3_000_000)
+            await publish(rig, "r2d2/events/map", bytes(12_000_000))  # more than the system takes
+            sent = 0
+            while not payloads(fleet, "fleet/r2d2/events/map"):
+                visit.send(Publish("fleet/r2d2/mission/go", b"", 0))
+                sent += 1
+                await asyncio.sleep(0.05)
+            assert sent > 20 and len(fleet.visits) == 1
+            assert rig.status().delivered > sent / 2, "commands that came through meanwhile"
+            await rig.drained()
+            robot.hang_up()
+
+
+@pytest.mark.patches
+async def test_answers_that_the_fleet_does_not_read_end_the_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a large message lies before them; it has no part in what is allowed."""
+    monkeypatch.setattr(channel_module, "MOST_UNSENT", 64 << 10)
+    async with (
+        FakeFleet() as fleet,
+        Relay(fleet.port) as relay,
+        running(Rig(tmp_path, relay.port)) as rig,
+    ):
+        visit = await fleet.visited()
+        await publish(rig, "r2d2/events/door", b"")
+        await rig.drained()
+        relay.silence("up")
+        await publish(rig, "r2d2/events/map", bytes(12_000_000))  # more than the system takes
+        came = rig.status().received
+        for number in range(60_000):
+            visit.send(Publish("fleet/r2d2/nobody", b"", 1, False, False, number + 1))
+        seen: list[int] = []
+        while len(seen) < 2 or seen[-1] > seen[-2]:
+            seen.append(rig.status().received - came)
+            await asyncio.sleep(1)
+        # With four bytes for each of them.
+        assert (64 << 10) / 4 < seen[-1] < (64 << 10) / 4 + 2000
+        assert len(fleet.visits) == 1
+        relay.release()
+        await until(lambda: rig.status().received - came == 60_000, "the rest")
+        await rig.drained()
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,9 @@ it still proves that the commands behind it are a queue.
 
 A client has one queue for all that it sends. So evidence holds for all of its topics, and there is
 a gap between two commands only if none of its messages lie in between. If the appliance has not
-read from a client for longer than `oldest`, the evidence begins anew, since the time at which the
-unread messages came is unknown. A command that comes in parts is as old as its first byte.
+read from a client for longer than `oldest`, or the computer has slept for as long, the evidence
+begins anew, since the time at which the unread messages came is unknown. A command that comes in
+parts is as old as its first byte.
 
 A queue ends with a silence or with the pace of steering, never after a time: without `sent-at`, a
 stream that is faster than `BURST` allows (125 Hz) is never carried out.
@@ -54,6 +55,7 @@ from typing import Protocol
 
 from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.broker.session import Session
+from appliance.host.clock import SleepWatch
 from appliance.mqtt.codec import Properties, Property, quote
 
 #: The user property with the time at which a command was made.
@@ -149,6 +151,8 @@ class StalenessDetector:
         #: The same for commands of QoS 2, as they come and before they are released.
         self._unreleased: dict[Session, _Pace] = {}
         self._expected_replays: OrderedDict[str, None] = OrderedDict()
+        #: A client that is awake sends, or queues, while the computer sleeps.
+        self._sleep = SleepWatch()
 
     def next_number(self) -> int:
         """Number a message for ROS that has come; the number is the same for all its routes."""
@@ -162,6 +166,7 @@ class StalenessDetector:
 
         `number` identifies the message, which may have several routes; -1 when it is unknown.
         """
+        now += self._sleep.seconds()
         pace = self._paces.get(origin)
         is_same = pace is not None and pace.number == number >= 0
         if pace is not None and pace.longest > oldest:
@@ -272,6 +277,7 @@ class StalenessDetector:
         Only now its pace can be measured, and whether it was unread for too long. `number`
         identifies the message, which may have several routes.
         """
+        now += self._sleep.seconds()
         unreleased = self._unreleased.get(origin)
         if unreleased is None or not unreleased.number == number >= 0:
             self._observe(unreleased, origin, oldest, now)
@@ -301,6 +307,7 @@ class StalenessDetector:
 
     def mark_stale(self, origin: Session, now: float) -> None:
         """A command has come that is known to be stale: the next ones were queued behind it."""
+        now += self._sleep.seconds()
         pace = self._paces.get(origin)
         if pace is not None:
             self._drop(pace, origin, "what came behind it is old")

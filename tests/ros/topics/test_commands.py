@@ -19,6 +19,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.link import PeerStatus
 from appliance.broker.message import DelayedMessage, Message
 from appliance.broker.values import Action, Decision
+from appliance.host import clock
 from appliance.mqtt.codec import Property, decode_varint
 from appliance.mqtt.packets import (
     Disconnect,
@@ -1262,6 +1263,27 @@ def test_who_left_while_it_drove():
     sender.say(0, "new")
     sender.rest(1)
     assert sender.moved == ["new"]
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_what_came_while_the_computer_slept_is_a_queue(qos, monkeypatch):
+    """The clock stands still in sleep: no silence is seen, but the client has sent all the time."""
+    slept = [7.0]
+    monkeypatch.setattr(clock, "_asleep", lambda: slept[0])
+    sender = Sender(qos)
+    for _ in range(20):
+        sender.say(0.05)
+    assert len(sender.moved) > 10
+    sender.moved.clear()
+    slept[0] += 20
+    for _ in range(50):
+        sender.say(0.0005, "old")
+    sender.rest(1)
+    assert not sender.moved
+    slept[0] += 20
+    sender.say(0.05, "alone")
+    sender.rest(1)
+    assert sender.moved == ["alone"]
 
 
 def test_clients_whose_return_is_expected_are_bounded():
