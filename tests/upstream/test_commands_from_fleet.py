@@ -236,7 +236,10 @@ async def test_a_fleet_that_does_not_answer_any_more_is_disconnected(robot: Robo
     fleet = robot.join()
     while not robot.robot.received:
         await robot.drive(fleet, 0.2)
-    # A late wake-up of `drive` may have been a silence, too, which was answered.
+    # A late wake-up of `drive` may have been a silence, too, with a probe that a command forgets.
+    robot.rig.now = robot.loop.time()
+    fleet.ping()
+    robot.say(fleet)
     probes = fleet.connection.probes
     fleet.connection.silence = 60.0
     await until(lambda: bool(fleet.connection.closed), "the end of the connection")

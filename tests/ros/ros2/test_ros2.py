@@ -470,6 +470,7 @@ async def test_refusals_of_ros_are_bus_errors():
     assert len(problems) == 3
 
 
+@pytest.mark.timed
 async def test_start_and_stop_at_any_moment():
     for wait in (0.0, 0.05, 0.3):
         node = ros2.Ros2Node()

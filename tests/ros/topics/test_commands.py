@@ -315,10 +315,11 @@ async def test_one_client_at_a_time(harness, caplog):
         a.drive()
         b.drive(b'{"linear":{"x":9}}')
     assert set(harness.robot.received) == {twist(0.5)}
+    # On a busy computer it may have ended before, and have been taken again.
+    await until(lambda: harness.commands.commanding is None, "the end of the lease")
     # What is logged is handed to the loop, behind what it is about.
     told = "was silent for 0.1 s and commands no more"
-    await until(lambda: told in caplog.text, "the end of the lease")
-    assert harness.commands.commanding is None
+    await until(lambda: told in caplog.text, "a line about it")
     b.wire.written = b""
     b.drive(b'{"linear":{"x":0.2}}', qos=1)
     assert b.code == 0
@@ -518,7 +519,7 @@ async def test_who_falls_silent_with_its_connection_is_disconnected(harness, imp
     assert harness.counters().expired == 1
     await asyncio.sleep(AFTER + 0.02)
     driver.drive()
-    await until(lambda: harness.robot.received[2:] == [twist(0.5)])
+    await until(lambda: harness.robot.received[2:3] == [twist(0.5)])  # and soon is stopped again
 
 
 async def test_who_is_silent_on_a_connection_that_lives_gets_the_stop_message_and_stays(
@@ -930,7 +931,8 @@ async def test_what_a_driver_had_queued_that_comes_back_unmarked(harness):
     assert harness.robot.received == [twist(0.5), STOP, STOP]
     driver.cut()
     Driver(harness.broker, "a").drive()
-    await until(lambda: harness.robot.received == [twist(0.5), STOP, STOP, twist(0.5)])
+    # Soon it is stopped again.
+    await until(lambda: harness.robot.received[:4] == [twist(0.5), STOP, STOP, twist(0.5)])
 
 
 async def test_a_stop_message_that_may_have_been_lost_is_published_again(harness):
@@ -2130,6 +2132,8 @@ async def test_a_stop_on_another_topic_overtakes_what_has_come(harness, rules, r
     if size:
         make_busy(harness)
     drivers = {name: Driver(harness.broker, name) for name in "ab"}
+    # On a busy computer a first command may be held for long enough before the stop has its turn.
+    drivers["a"].wire.connection = PeerStatus(has_unread=True)
     drivers["a"].drive(large(0.5, size), qos=1)
     assert drivers["a"].code == 0
     stop_beside(drivers[who], properties=made(0))
@@ -2137,6 +2141,7 @@ async def test_a_stop_on_another_topic_overtakes_what_has_come(harness, rules, r
         # Without rules nothing is known of a stop before its turn, behind the large one.
         await until(lambda: harness.robot.received)
     assert harness.robot.received == [STOP]
+    drivers["a"].wire.connection = PeerStatus()
     await until(lambda: total(harness, "expired") == 1)
     assert harness.robot.received == [STOP]
     assert "a stop came after it" in harness.bridge.status()[0].last_error
