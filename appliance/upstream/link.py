@@ -512,9 +512,10 @@ class FleetConnection(Generic[T]):
             due = now + interval * PING_AFTER
         if not self._pings:
             return due
-        answered = max(self._since(self._pings[0], now), self._received_at)
-        deadline = answered + interval * ANSWER_WITHIN
-        is_full = len(self._pings) >= MAXIMUM_PINGS and self._unread_at < now
+        since = self._since(self._pings[0], now)
+        deadline = max(since, self._received_at) + interval * ANSWER_WITHIN
+        # They may all have waited behind one large message.
+        is_full = len(self._pings) >= MAXIMUM_PINGS and since + PATIENCE <= now
         if deadline <= now or is_full:
             self._give_up(f"no PINGRESP, and silent for {now - self._received_at:.1f} s")
         return min(due, deadline)

@@ -984,7 +984,30 @@ def test_pings_that_are_never_answered_are_bounded():
         fake.link.ping()
     assert len(fake.sent()) == MAXIMUM_PINGS
     fake.tick()
+    for _ in range(int(PATIENCE)):  # it is not silent
+        assert fake.link.ended is None
+        fake.say(Publish("a", b""))
+        fake.tick(1)
     assert fake.ending()[0] is EndedBy.NETWORK
+
+
+def test_pings_behind_a_large_message_that_leaves_slowly_are_not_missed():
+    """One every 50 ms, and a map that takes two minutes: all of them leave together, after it."""
+    fake = Fake(keep_alive=60).open()
+    size = 12_000_000
+    fake.link.publish("t", "map", bytes(size))
+    fake.link.take(fake.now)
+    for left in range(size, 0, -size // 240):
+        for _ in range(10):
+            fake.link.ping()
+        fake.link.take(fake.now)
+        fake.tick(0.5, left)
+        assert fake.link.ended is None
+    fake.tick(0.5)
+    assert fake.link.ended is None
+    fake.say(*[Pingresp()] * MAXIMUM_PINGS)
+    fake.tick(1)
+    assert fake.link.ended is None
 
 
 @pytest.mark.parametrize("what", ["PUBACK", "SUBACK", "UNSUBACK"])
