@@ -545,6 +545,7 @@ class Backlog:
         age = self._limits.age
         before = self._flying_size
         room = IN_FLIGHT_SIZE - before - self._again_size
+        may_repeat = HELD in self._queues.by_name
         taken = 0  # bytes of memory
         while len(entries) < most and size > 0 and taken < room and waiting:
             try:
@@ -555,6 +556,8 @@ class Backlog:
             if expires_at is not None and expires_at <= now:
                 break  # to drop it, too
             if age is not None and stored_at + age <= now:
+                break
+            if may_repeat and record.number in flying:
                 break
             data, part, index = queue.pop_waiting()
             length = len(data)
@@ -695,6 +698,10 @@ class Backlog:
                 self._discard(entry, reason)
                 return None
             self._again_size -= entry.size + ENTRY_OVERHEAD
+            if record.number in self._flying:  # the same one from the other place
+                self._tally.restored -= 1
+                self._end(entry)
+                return None
             return self._hand_out(entry, now)
         if queue.latest and (value := queue.latest_before()) is not None:
             if value.data is not None:
@@ -715,8 +722,11 @@ class Backlog:
             queue.settle(part, index)
             self._check_emptied(queue)
             return None
-        if queue.name != HELD and record.number in self._repeated:
-            self._repeated.remove(record.number)
+        is_repeated = queue.name != HELD and record.number in self._repeated
+        # What was held may be in its journal, too: that it was settled there out of order was not
+        # stored.
+        if is_repeated or record.number in self._flying:
+            self._repeated.discard(record.number)
             self._tally.restored -= 1
             self._tally.remove(queue, len(data))
             queue.settle(part, index)
@@ -930,6 +940,13 @@ class Backlog:
         self._land(entry)
         self._end(entry)
         return True
+
+    def drop(self, entry: Entry, reason: DropReason) -> None:
+        """It was handed out, and is not sent: that would be in vain."""
+        if entry.state == IN_FLIGHT:
+            self._tally.drop(entry.queue, reason)
+            self._land(entry)
+            self._end(entry)
 
     def set_aside(self, entry: Entry, reason: str, now: float) -> None:
         """The fleet's broker will never take it: keep it for the user, and send what follows."""

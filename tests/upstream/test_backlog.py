@@ -1227,6 +1227,35 @@ def test_what_was_put_off_and_then_was_too_large_is_sent_where_it_fits(is_journa
     assert not link.dropped() and link.counts().waiting == 0
 
 
+@pytest.mark.parametrize("is_held_again", [False, True])
+def test_what_is_held_and_in_its_journal_after_a_restart_counts_once(is_held_again: bool) -> None:
+    """It was settled there out of order, which is not stored."""
+    link = Link()
+    for payload in ("first", "large", "last"):
+        link.offer(payload)
+    _, large = link.take(2)
+    assert link.backlog.hold(large, 10, link.backlogs.time)
+    link.backlogs.commit()
+    link.restart()
+    assert link.counts().waiting == 4
+    if is_held_again:
+        link.backlog.rewind()
+        link.backlog.connected(10)
+        for entry in link.take():
+            if entry.record.payload == b"large":
+                assert link.backlog.hold(entry, 10, link.backlogs.time)
+        link.backlog.rewind()
+        link.backlog.connected(1 << 20)
+    entries = link.take()
+    assert sorted(entry.record.payload for entry in entries) == [b"first", b"large", b"last"]
+    for entry in entries:
+        link.backlog.settle(entry)
+    assert link.next() is None
+    counts = link.counts()
+    assert (counts.waiting, counts.in_flight, counts.bytes) == (0, 0, 0)
+    assert counts.restored == counts.sent == 3
+
+
 @pytest.mark.parametrize("restarts", [False, True])
 def test_what_is_held_is_the_first_to_be_dropped(restarts: bool) -> None:
     """Of a rule of normal priority: what cannot be sent now goes before what can."""
