@@ -120,9 +120,12 @@ class WebSocketClient(WebSocketLayer):
                 "the broker closed the connection instead of an answer; is the port one for "
                 f"{others}?"
             )
+        protocol = cast(UpstreamTransport, self._protocol)
         closed = self._frames.close_rcvd
         if closed is not None:
             reason = f"{int(closed.code)} {closed.reason}".strip()
             self._protocol.log_refusal("the broker has closed the WebSocket", reason)
+            if self._frames.close_rcvd_then_sent is not False:
+                protocol.was_closed = True  # as by a FIN
         self._free_frames()
-        cast(UpstreamTransport, self._protocol).connection_lost(exc)
+        protocol.connection_lost(exc)

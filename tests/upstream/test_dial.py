@@ -640,6 +640,7 @@ async def test_frames_that_end_a_websocket(site, bad):
     assert got[0] == 0x8A and got[1] == 0x84  # a pong, masked
     said = {"text": "text frame", "large": "too large", "close": "1008 go away"}
     assert said.get(bad, "not the WebSocket protocol") in owner.reasons[0]
+    assert transport.was_closed == (bad == "close")
 
 
 # --- the transport -------------------------------------------------------------------------------
