@@ -72,6 +72,8 @@ class _PendingCommand:
     came_at: float
     due: float
     timer: asyncio.TimerHandle
+    #: See `StalenessDetector.slept`.
+    slept: float
 
 
 @dataclass(slots=True, eq=False)
@@ -83,6 +85,8 @@ class _Command:
     #: See `StalenessDetector.number`: the order in which commands came, across all topics.
     number: int
     at: float
+    #: See `StalenessDetector.slept`.
+    slept: float
     verdict: CommandVerdict
     #: Why it must not be carried out, unless it stops the robot.
     why: str
@@ -193,14 +197,14 @@ class Commands(ToRos):
     ) -> _Command:
         """Judge a command by everything but its payload."""
         # The time of the chunk: all messages in it came at once, however long they take.
-        now = self._context.broker.now
+        now, slept = self._context.broker.now, self._staleness.slept
         verdict = CommandVerdict.CARRY_OUT
         refusal = QUEUED
         try:
             why = self._old_by_itself(message) or self._old_by_delivery(message, retain, origin)
             is_proven = sent_at(message.properties) is not None
         except ValueError as error:  # refused, unless its payload stops the robot
-            return _Command(message, origin, number, now, verdict, str(error), is_wrong=True)
+            return _Command(message, origin, number, now, slept, verdict, str(error), is_wrong=True)
         if origin is not None:
             if why and origin.link is not None:
                 self._drop_first(origin, why)
@@ -213,7 +217,7 @@ class Commands(ToRos):
             self._drop_first(origin, why or refusal)
             if verdict is CommandVerdict.WAIT:
                 self._staleness.add_pending(origin, self)
-        return _Command(message, origin, number, now, verdict, why, refusal=refusal)
+        return _Command(message, origin, number, now, slept, verdict, why, refusal=refusal)
 
     def _finish(self, command: _Command) -> PublishRejection | None:
         """Convert it and carry it out, if it still may be; a fault of the appliance is a rejection,
@@ -318,7 +322,7 @@ class Commands(ToRos):
         if self._lease.is_overtaken(command.number, command.origin):
             return OVERTAKEN
         oldest = self.rules.oldest
-        waited = self._context.entries.time() - command.at
+        waited = self._context.entries.time() - command.at + self._staleness.slept - command.slept
         try:
             why = self._old_by_itself(command.message)
         except ValueError as error:  # the clock was set
@@ -455,8 +459,9 @@ class Commands(ToRos):
         accounting.take(origin.account, size)
         due = command.at + self._staleness.waiting_time(origin, self.rules.oldest)
         timer = self._wait_until(due, origin)
-        waiting = _PendingCommand(message, command.number, cdr, size, command.at, due, timer)
-        self._pending[origin] = waiting
+        self._pending[origin] = _PendingCommand(
+            message, command.number, cdr, size, command.at, due, timer, command.slept
+        )
         return None
 
     def _wait_until(self, when: float, origin: Session) -> asyncio.TimerHandle:
@@ -498,6 +503,9 @@ class Commands(ToRos):
         now = self._context.entries.time()
         waiting = self._pending[origin]
         self._context.broker.accounting.now = now
+        if self._staleness.slept != waiting.slept:
+            self._abandon_pending(origin, "the computer has slept since it came")
+            return
         peer = LOCAL_PEER if origin.link is None else origin.link.peer_status()
         # The unread messages need not be commands.
         if peer.has_unread or peer.flowing >= now - waiting.came_at:

@@ -154,6 +154,11 @@ class StalenessDetector:
         #: A client that is awake sends, or queues, while the computer sleeps.
         self._sleep = SleepWatch()
 
+    @property
+    def slept(self) -> float:
+        """Seconds in which the computer has slept since the start; no clock here counts them."""
+        return self._sleep.seconds()
+
     def next_number(self) -> int:
         """Number a message for ROS that has come; the number is the same for all its routes."""
         self.number += 1
@@ -166,7 +171,7 @@ class StalenessDetector:
 
         `number` identifies the message, which may have several routes; -1 when it is unknown.
         """
-        now += self._sleep.seconds()
+        now += self.slept
         pace = self._paces.get(origin)
         is_same = pace is not None and pace.number == number >= 0
         if pace is not None and pace.longest > oldest:
@@ -277,7 +282,7 @@ class StalenessDetector:
         Only now its pace can be measured, and whether it was unread for too long. `number`
         identifies the message, which may have several routes.
         """
-        now += self._sleep.seconds()
+        now += self.slept
         unreleased = self._unreleased.get(origin)
         if unreleased is None or not unreleased.number == number >= 0:
             self._observe(unreleased, origin, oldest, now)
@@ -307,7 +312,7 @@ class StalenessDetector:
 
     def mark_stale(self, origin: Session, now: float) -> None:
         """A command has come that is known to be stale: the next ones were queued behind it."""
-        now += self._sleep.seconds()
+        now += self.slept
         pace = self._paces.get(origin)
         if pace is not None:
             self._drop(pace, origin, "what came behind it is old")

@@ -1288,6 +1288,34 @@ def test_what_came_while_the_computer_slept_is_a_queue(qos, monkeypatch):
     assert sender.moved == ["alone"]
 
 
+async def test_a_command_that_waits_while_the_computer_sleeps_is_old(harness, monkeypatch):
+    slept = [7.0]
+    monkeypatch.setattr(clock, "_asleep", lambda: slept[0])
+    harness.start(CommandRules(expire=0.5))
+    driver = Driver(harness.broker, "a")
+    driver.drive()
+    slept[0] += 3600
+    await until(lambda: harness.counters().expired == 1, "it to be dropped")
+    assert "the computer has slept since it came" in harness.bridge.status()[0].last_error
+    await asyncio.sleep(0.2)
+    assert harness.robot.received == []
+    driver.drive()
+    await until(lambda: harness.robot.received == [twist(0.5)], "the next one")
+
+
+async def test_a_large_command_that_waits_while_the_computer_sleeps_is_old(harness, monkeypatch):
+    slept = [7.0]
+    monkeypatch.setattr(clock, "_asleep", lambda: slept[0])
+    harness.start(CommandRules(expire=30.0))
+    make_busy(harness)
+    driver = Driver(harness.broker, "a")
+    driver.drive(large(0.5, 20_000), qos=1)
+    slept[0] += 3600
+    await until(lambda: harness.counters().expired == 1, "it to be dropped")
+    assert "waited for its turn to be converted for 3600" in harness.bridge.status()[0].last_error
+    assert harness.robot.received == []
+
+
 def test_clients_whose_return_is_expected_are_bounded():
     staleness = StalenessDetector()
     for number in range(2 * EXPECTED):
