@@ -25,6 +25,7 @@ class DropReason(Enum):
     REPLACED = "replaced"  # by a newer one of its topic
     OFFLINE = "offline"  # its rule keeps nothing without a connection
     UNREADABLE = "unreadable"  # damaged on the disk
+    CLOSED_UPON = "closed upon"  # the fleet's broker has closed the connection upon its topic
 
 
 def too_old(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -13,6 +14,7 @@ from appliance.mqtt.codec import NO_PROPERTIES, V5, quote
 from appliance.mqtt.reason import ReasonCode
 from appliance.upstream.agreement import EndedBy, Ending
 from appliance.upstream.backlog import Backlog
+from appliance.upstream.backlog_counts import DropReason
 from appliance.upstream.limits import FleetLimits
 from appliance.upstream.link import FleetConnection
 from appliance.upstream.publish_properties import PublishProperties
@@ -54,13 +56,25 @@ CLOSES_ON_MESSAGE: Final = POISON | {
     ReasonCode.QOS_NOT_SUPPORTED,
 }
 
-#: Messages beside the suspects after which the rest of these is forgotten.
+#: Messages beside the suspects after which the rest of these is forgotten; and those after which
+#: none with QoS 0 is suspected any more.
 PATIENCE: Final = 1000
+PATIENCE_UNANSWERED: Final = 200
 
 #: A message is set aside when the broker has closed the connection so often on it, sent alone.
 #: Messages are sent alone after so many connections that ended without any progress.
 CLOSED_ON: Final = 3
 WITHOUT_PROGRESS: Final = 2
+
+#: What stands for messages with QoS 0 among the suspects: no topic is empty. Connections that end
+#: without any other message count together when they do so within these seconds.
+UNANSWERED: Final = ""
+STUCK_WITHIN: Final = 600.0
+
+#: Seconds for which nothing is sent to a topic upon which the broker closes, where messages take
+#: each other's place; then it is tried again. And the most such topics.
+FORBIDDEN_FOR: Final = 3600.0
+MOST_FORBIDDEN: Final = 1000
 
 #: Topics of which it is known whether they can be sent; with more, all are forgotten. Longer ones,
 #: in bytes of UTF-8, are looked at each time.
@@ -91,6 +105,13 @@ class Sender:
         #: in a row that was so.
         self._stuck_on: int | str = -1
         self._stuck = 0
+        #: Of messages with QoS 0: whether some were sent since the last acknowledgement, and when
+        #: connections began to end with none but these on their way.
+        self._has_sent_unanswered = False
+        self._stuck_since = -math.inf
+        #: Topics upon which the broker has closed so often that what waits for them is dropped, up
+        #: to a time.
+        self._forbidden: dict[str, float] = {}
         #: Messages on one of which the broker may have closed, with how often it has when the
         #: message was sent alone. While there are any, one message is sent at a time, and none with
         #: QoS 0: the one that is in flight would be blamed for it.
@@ -112,6 +133,7 @@ class Sender:
         """A connection is up, with these limits."""
         self._use(limits)
         self._topics.clear()
+        self._has_sent_unanswered = False
         self._backlog.connected(limits.packet_size)
 
     def _use(self, limits: FleetLimits) -> None:
@@ -163,6 +185,9 @@ class Sender:
         where it is not set."""
         record = entry.record
         topic, payload = record.topic, record.payload
+        if self._forbidden and self._is_forbidden(entry):
+            self._backlog.drop(entry, DropReason.CLOSED_UPON)
+            return
         properties = NO_PROPERTIES
         if is_v5:
             properties = record.properties_wire
@@ -189,7 +214,18 @@ class Sender:
         if code:
             self._set_aside(entry, f"the fleet's broker does not take it: {reason_words(code)}")
         elif not qos:
+            self._has_sent_unanswered = True
             self._backlog.settle(entry)
+
+    def _is_forbidden(self, entry: Entry) -> bool:
+        """Whether the broker would close the connection upon it, most likely."""
+        until = self._forbidden.get(entry.record.topic)
+        if until is None or _mark(entry) != entry.record.topic:
+            return False
+        if self._clock() < until:
+            return True
+        del self._forbidden[entry.record.topic]
+        return False
 
     def _look_at(self, topic: str) -> tuple[int, str]:
         """The bytes of a topic, and why it cannot be used there."""
@@ -203,6 +239,9 @@ class Sender:
     def acknowledged(self, entries: Sequence[Entry | None], code: int, reason: str) -> None:
         """Messages were acknowledged, or refused with a code of 0x80 or above."""
         ours = [entry for entry in entries if entry is not None]
+        self._has_sent_unanswered = False
+        if self._stuck and any(_mark(entry) == self._stuck_on for entry in ours):
+            self._stuck_on, self._stuck = -1, 0
         if self._suspects:
             for entry in ours:
                 self._clear(entry)
@@ -224,6 +263,7 @@ class Sender:
         self._patience -= 1
         if self._patience <= 0:
             self._suspects.clear()
+            self._stuck_on, self._stuck = -1, 0
 
     def end(self, ending: Ending, inflight: Sequence[Entry | None], *, was_settled: bool) -> bool:
         """The connection has ended with these messages in flight: they are sent again.
@@ -232,10 +272,25 @@ class Sender:
         Returns whether one of them may be the reason: it is not the first connection to end on it.
         """
         ours = [entry for entry in inflight if entry is not None]
-        if ours and was_settled and _may_be_poison(ending):
-            self._suspect(ours, ending)
+        is_upon = bool(ours) or self._has_sent_unanswered
+        if is_upon and was_settled and _may_be_poison(ending):
+            if ours:
+                self._suspect(ours, ending)
+            else:
+                self._suspect_unanswered()
         self._backlog.rewind()
-        return bool(ours) and (bool(self._suspects) or self._stuck >= WITHOUT_PROGRESS)
+        return is_upon and (bool(self._suspects) or self._stuck >= WITHOUT_PROGRESS)
+
+    def _suspect_unanswered(self) -> None:
+        """The broker has closed the connection with none in flight, perhaps because of a message
+        with QoS 0: from now on such messages are sent with QoS 1, so that the one is found."""
+        now = self._clock()
+        if self._stuck_on != UNANSWERED or now > self._stuck_since + STUCK_WITHIN:
+            self._stuck_on, self._stuck, self._stuck_since = UNANSWERED, 0, now
+        self._stuck += 1
+        if self._stuck >= WITHOUT_PROGRESS and not self._suspects:
+            self._suspects = {UNANSWERED: 0}
+            self._patience = PATIENCE_UNANSWERED
 
     def _suspect(self, inflight: list[Entry], ending: Ending) -> None:
         """The broker has closed the connection: perhaps because of one of these messages."""
@@ -245,6 +300,9 @@ class Sender:
             closed = self._suspects[mark] = self._suspects.get(mark, 0) + 1
             if closed >= CLOSED_ON:
                 del self._suspects[mark]
+                self._suspects.pop(UNANSWERED, None)
+                if isinstance(mark, str):
+                    self._forbid(mark)
                 self._set_aside(
                     first,
                     f"the connection has ended {CLOSED_ON} times when the fleet's broker was sent "
@@ -256,6 +314,12 @@ class Sender:
         if self._stuck >= WITHOUT_PROGRESS:
             self._suspects = {_mark(entry): 0 for entry in inflight}
             self._patience = len(inflight) + PATIENCE
+
+    def _forbid(self, topic: str) -> None:
+        """Send nothing for a topic for a while, of which only the newest message counts."""
+        while len(self._forbidden) >= MOST_FORBIDDEN:
+            del self._forbidden[next(iter(self._forbidden))]
+        self._forbidden[topic] = self._clock() + FORBIDDEN_FOR
 
     def _set_aside(self, entry: Entry, reason: str) -> None:
         now = self._clock()

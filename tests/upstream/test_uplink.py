@@ -6,6 +6,8 @@ import asyncio
 import json
 import math
 import threading
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,11 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     hurry(monkeypatch)
 
 
+#: Rules with a state of QoS 0, and a topic of it there.
+LATEST_STATE = [{"topic": "events/#"}, {"topic": "state/#", "keep": "latest", "qos": 0}]
+ODOM = "fleet/r2d2/state/odom"
+
+
 async def publish(rig: Rig, topic: str, *payloads: bytes, qos: int = 1, retain: bool = False):
     """Publish them as a local client; they are acknowledged when this returns."""
     peer = await rig.client("publisher")
@@ -55,6 +62,24 @@ async def publish(rig: Rig, topic: str, *payloads: bytes, qos: int = 1, retain: 
     codes = [(await peer.receive()).reason_code for _ in payloads] if qos else []
     peer.hang_up()
     return codes
+
+
+@asynccontextmanager
+async def steady(rig: Rig, *topics: str) -> AsyncIterator[None]:
+    """Somebody publishes to them with QoS 0 all the time."""
+    peer = await rig.client("steady")
+
+    async def go_on() -> None:
+        while True:
+            await peer.send(*[Publish(topic, b"x", 0) for topic in topics])
+            await asyncio.sleep(0.01)
+
+    going = asyncio.create_task(go_on())
+    try:
+        yield
+    finally:
+        going.cancel()
+        peer.hang_up()
 
 
 def payloads(fleet: FakeFleet, topic: str) -> list[bytes]:
@@ -370,28 +395,37 @@ async def test_a_poisonous_message_that_overtakes_another_one_blocks_nothing_eit
 
 async def test_whoever_is_in_flight_is_not_blamed_for_a_message_with_qos_0(tmp_path: Path) -> None:
     """The fleet closes upon a topic with QoS 0, whose newest value waits at each connection."""
-    rules = [{"topic": "events/#"}, {"topic": "state/#", "keep": "latest", "qos": 0}]
-    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port, out=rules)) as rig:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port, out=LATEST_STATE)) as rig:
         await fleet.visited()
         await rig.connected()
-        fleet.acknowledge = close_at("fleet/r2d2/state/odom")
-        peer = await rig.client("odometry")
+        fleet.acknowledge = close_at(ODOM)
         sent = [b"%d" % number for number in range(30)]
-
-        async def drive() -> None:
-            while True:
-                await peer.send(Publish("r2d2/state/odom", b"x", 0))
-                await asyncio.sleep(0.005)
-
-        driving = asyncio.create_task(drive())
-        await publish(rig, "r2d2/events/door", *sent)
-        bad = {"fleet/r2d2/state/odom"}
-        await until(lambda: {each["topic"] for each in rig.uplink.aside()} >= bad, "it to be told")
-        driving.cancel()
-        peer.hang_up()
+        async with steady(rig, "r2d2/state/odom"):
+            await publish(rig, "r2d2/events/door", *sent)
+            await until(lambda: rig.uplink.aside(), "it to be told")
         await rig.drained()
-        assert {each["topic"] for each in rig.uplink.aside()} == bad
+        assert {each["topic"] for each in rig.uplink.aside()} == {ODOM}
         assert set(payloads(fleet, "fleet/r2d2/events/door")) == set(sent)
+
+
+async def test_a_topic_with_qos_0_upon_which_the_fleet_closes_is_found_and_left_out(
+    tmp_path: Path,
+) -> None:
+    """Nothing else is under way when it closes, and the next value comes after each reconnect."""
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port, out=LATEST_STATE)) as rig:
+        await fleet.visited()
+        await rig.connected()
+        fleet.acknowledge = close_at(ODOM)
+        async with steady(rig, "r2d2/state/odom", "r2d2/state/battery"):
+            await until(lambda: "closed upon" in str(rig.status().dropped), "it to be left out")
+            assert [each["topic"] for each in rig.uplink.aside()] == [ODOM]
+            visits = len(fleet.visits)
+            await publish(rig, "r2d2/events/door", *[b"%d" % number for number in range(300)])
+            door, battery = "fleet/r2d2/events/door", "fleet/r2d2/state/battery"
+            await until(lambda: len(payloads(fleet, door)) == 300, "the events")
+            came = len(payloads(fleet, battery))
+            await until(lambda: len(payloads(fleet, battery)) > came + 5, "another topic")
+            assert len(fleet.visits) == visits
 
 
 async def test_while_a_large_message_leaves_slowly_the_link_is_read(tmp_path: Path) -> None:
