@@ -55,7 +55,8 @@ class SleepWatch:
     """Counts the seconds in which the computer slept: the monotonic clock stands still in sleep."""
 
     def __init__(self) -> None:
-        self._first = self._slept = _asleep()
+        # The most of several readings: one that came out low would make the next a sleep.
+        self._first = self._slept = max(_asleep() for _ in range(5))
 
     def seconds(self) -> float:
         """Seconds of sleep since this was made; the same number until there was more."""

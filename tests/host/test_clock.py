@@ -162,6 +162,13 @@ def test_sleep_is_what_the_monotonic_clock_does_not_count(monkeypatch: pytest.Mo
     assert watch.seconds() == 20
 
 
+def test_a_first_reading_that_is_held_up_is_no_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
+    readings = iter([49.9, 50.0, 50.0, 49.0, 50.0, 50.0, 50.0])
+    monkeypatch.setattr(clock, "_asleep", lambda: next(readings))
+    watch = SleepWatch()
+    assert watch.seconds() == watch.seconds() == 0
+
+
 def test_no_sleep_is_seen_while_the_computer_is_awake() -> None:
     watch = SleepWatch()
     assert not any(watch.seconds() for _ in range(20_000))
