@@ -51,7 +51,12 @@ both_ways = pytest.mark.parametrize("tls", [True, False], ids=["tls", "plain"])
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
-    process = ApplianceProcess(tmp_path_factory.mktemp("robot"), users={"bob": "b"}, acl=ACL)
+    process = ApplianceProcess(
+        tmp_path_factory.mktemp("robot"),
+        users={"bob": "b"},
+        acl=ACL,
+        broker={"limits": {"connect_timeout": f"{PATIENCE:g} s"}},
+    )
     process.start()
     yield process
     process.stop()

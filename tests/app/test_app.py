@@ -37,7 +37,7 @@ class Peer:
 
     def __init__(self, process: ApplianceProcess, user: str) -> None:
         self._socket = process.open(tls=False)
-        self._socket.settimeout(10)
+        self._socket.settimeout(PATIENCE)
         password = process.passwords[user].encode()
         self.send(Connect(f"{user}-peer", username=user, password=password))
         answer = self.read()
@@ -81,7 +81,12 @@ class Peer:
 
 @pytest.fixture
 def process(tmp_path: Path):
-    process = ApplianceProcess(tmp_path, users={"bob": "bobs password"}, acl=ACL)
+    process = ApplianceProcess(
+        tmp_path,
+        users={"bob": "bobs password"},
+        acl=ACL,
+        broker={"limits": {"connect_timeout": f"{PATIENCE:g} s"}},
+    )
     process.start()
     yield process
     process.stop()

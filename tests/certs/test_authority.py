@@ -26,6 +26,7 @@ from cryptography.hazmat.primitives.serialization import (
     PrivateFormat,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID
+from waiting import PATIENCE
 
 from appliance import certs
 from appliance.certs import CertificateError, addresses, authority, files, load_key
@@ -280,11 +281,12 @@ def test_the_readme_names_every_file(own: Path) -> None:
 )
 def test_openssl_accepts_the_chain(made: Path, file: str, purpose: str) -> None:
     command = ["openssl", "verify", "-x509_strict", "-purpose", purpose, "-CAfile", made / "ca.crt"]
-    done = subprocess.run([*command, made / file], capture_output=True, text=True, timeout=10)
+    done = subprocess.run([*command, made / file], capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     wrong = "sslclient" if purpose == "sslserver" else "sslserver"
     command[command.index(purpose)] = wrong
-    assert subprocess.run([*command, made / file], capture_output=True, timeout=10).returncode != 0
+    done = subprocess.run([*command, made / file], capture_output=True, timeout=PATIENCE)
+    assert done.returncode != 0
 
 
 # Handshakes
@@ -301,7 +303,7 @@ def handshake(
         try:
             plain, _ = listener.accept()
             with plain:
-                plain.settimeout(5)
+                plain.settimeout(PATIENCE)
                 with server.wrap_socket(plain, server_side=True) as connection:
                     found.append((connection.version(), connection.getpeercert()))
                     connection.sendall(b"x")
@@ -309,12 +311,12 @@ def handshake(
             errors.append(error)
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.settimeout(5)
+        listener.settimeout(PATIENCE)
         thread = threading.Thread(target=serve, args=(listener,))
         thread.start()
         try:
             with (
-                socket.create_connection(listener.getsockname(), timeout=5) as plain,
+                socket.create_connection(listener.getsockname(), timeout=PATIENCE) as plain,
                 client.wrap_socket(plain, server_hostname=hostname) as connection,
             ):
                 # In TLS 1.3 a client only learns here that its certificate was refused.
@@ -323,7 +325,7 @@ def handshake(
         except OSError as error:
             errors.insert(0, error)
         finally:
-            thread.join(10)
+            thread.join(2 * PATIENCE)
     if errors:
         raise errors[0]
     return found[0]

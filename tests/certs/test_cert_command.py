@@ -23,6 +23,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
+from waiting import PATIENCE
 
 from appliance import certs
 from appliance.certs.requests import load_request
@@ -33,7 +34,7 @@ needs_openssl = pytest.mark.skipif(
 
 
 def openssl(*arguments: str | Path) -> str:
-    done = subprocess.run(["openssl", *arguments], capture_output=True, text=True, timeout=10)
+    done = subprocess.run(["openssl", *arguments], capture_output=True, text=True, timeout=PATIENCE)
     return f"{done.stdout}{done.stderr}\nexit {done.returncode}"
 
 

@@ -170,12 +170,13 @@ def test_find_lists_it(judge: Computer, other: Computer, robot: Robot, tmp_path:
     ca = certs.fingerprints(robot.ca)[0].replace(":", "")
     same = {"robot": "r2d2", "name": "r2d2", "mqtt": [8883], "console": [8443], "ca": ca}
     own = {**same, "addresses": ["192.0.2.1"], "trusted": True}
-    assert find(judge, "--ca", robot.ca) == [own]
+    eventually(lambda: find(judge, "--ca", robot.ca) == [own], "what the judge finds")
     # Each network is told the addresses that are in it.
     there = {**same, "addresses": ["198.51.100.1"]}
-    assert find(other) == [there]
+    eventually(lambda: find(other) == [there], "what the other computer finds")
     # Who is in both, as the robot itself is, can use either.
-    assert [each["addresses"] for each in find(robot.computer)] == [["192.0.2.1", "198.51.100.1"]]
+    both = [["192.0.2.1", "198.51.100.1"]]
+    eventually(lambda: [each["addresses"] for each in find(robot.computer)] == both, "both of them")
     certs.create_authority(tmp_path)
     told = find(judge, "--ca", tmp_path / "ca.crt", code=1)
     assert told == [{**own, "trusted": False}]
@@ -217,8 +218,8 @@ def test_addresses_are_followed(
     robot.announced("192.0.2.4", "192.0.2.5")
     (found,) = services(judge)
     assert found[0] == "r2d2"
-    addresses = [each["addresses"] for each in find(judge)]
-    assert addresses == [["192.0.2.4", "192.0.2.5"]]
+    both = [["192.0.2.4", "192.0.2.5"]]
+    eventually(lambda: [each["addresses"] for each in find(judge)] == both, "both of them")
 
 
 def test_a_setting_turns_it_off(judge: Computer, robot: Robot) -> None:

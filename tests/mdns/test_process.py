@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
@@ -162,9 +163,13 @@ async def test_one_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) 
     async with running("sleep 1000 & echo $! > child; wait") as process:
         process.announce(WANTED)
         await until(lambda: process.pid and child())  # not while it is being started
-    await until(
-        lambda: not psutil.pid_exists(child()) or psutil.Process(child()).status() == "zombie"
-    )
+    await until(lambda: not is_running(child()))
+
+
+def is_running(pid: int) -> bool:
+    with contextlib.suppress(psutil.NoSuchProcess):  # it may end while it is asked about
+        return psutil.Process(pid).status() != "zombie"
+    return False
 
 
 async def test_a_line_that_is_too_long(caplog: pytest.LogCaptureFixture) -> None:
