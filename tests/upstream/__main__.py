@@ -10,6 +10,7 @@
     python tests/upstream --late --ros --version 3.1.1    # with a real node of ROS
     python tests/upstream --calls 1000 --ros              # and 100 goals
     python tests/upstream --faults 10
+    python tests/upstream --faults 10 --fleet appliance   # which looks each second who is silent
     python tests/upstream --links 200                     # one RabbitMQ is killed and started
 
 The exit code is 1 when anything is wrong, 2 when a program is missing. The seed that is printed
@@ -60,10 +61,12 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     what.add_argument("--links", type=int, metavar="N", help="so many reconnect at once")
     parser.add_argument("--seed", type=int, default=secrets.randbits(32))
     parser.add_argument("--device", choices=DEVICES, default="appliance")
-    kills = parser.add_argument_group("with --kills")
-    kills.add_argument(
-        "--fleet", choices=FLEETS, help="(default: mosquitto; with --links, rabbitmq)"
+    parser.add_argument(
+        "--fleet",
+        choices=FLEETS,
+        help="with --kills, --faults, --links (default: mosquitto; with --links, rabbitmq)",
     )
+    kills = parser.add_argument_group("with --kills")
     who = kills.add_mutually_exclusive_group()
     who.add_argument("--both", action="store_true", help="kill the fleet's broker, too")
     who.add_argument("--nobody", action="store_true", help="only cut the line")
@@ -106,7 +109,9 @@ def program(options: argparse.Namespace, directory: Path, say: Callable[[str], N
             **common,
         ).run
     if options.faults is not None:
-        return Faults(directory, options.seed, seconds=options.faults * 60, **common).run
+        fleet = options.fleet or "mosquitto"
+        seconds = options.faults * 60
+        return Faults(directory, options.seed, seconds=seconds, fleet=fleet, **common).run
     if options.ros:
         return ros_program(options, directory, common)
     if options.late:

@@ -24,8 +24,12 @@ KEEP_ALIVE = 5.0
 #: Seconds behind the end of a fault until messages flow again: a backoff of a minute at the most.
 STALL = 75.0
 
-#: Seconds behind 1.5 keep alives: the broker looks now and then, the computer is busy.
+#: Seconds behind 1.5 keep alives: the computer is busy.
 LENIENCE = 2.0
+
+#: Seconds between two looks of a fleet's broker at who is silent. mosquitto 2.0 looks every sixth
+#: second (src/keepalive.c): with a keep alive of 5 s its will comes after 7.2 to 13.0 s.
+LOOKS = {"mosquitto": 6.0}
 
 #: Bytes by which the device may grow after its first tenth.
 GROWTH = 16 << 20
@@ -200,6 +204,6 @@ class Faults(Trial[Report]):
             report.repeated += account.repeated(numbers)
             report.problems += account.loss(topic, owed, numbers)
             report.problems += account.order(topic, numbers, relay.accepted)
-        grace = 1.5 * KEEP_ALIVE + LENIENCE
+        grace = 1.5 * KEEP_ALIVE + LOOKS.get(self.fleet_kind, 0.0) + LENIENCE
         report.problems += account.truth(self.states, self.carried, grace)
         report.problems += account.growth(report.memory, GROWTH)

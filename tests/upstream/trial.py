@@ -1,4 +1,4 @@
-"""What all tries of the link begin and end with: a fleet's mosquitto, a line to it, a device."""
+"""What all tries of the link begin and end with: a fleet's broker, a line to it, a device."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Generic, TypeVar
 
 from upstream.client import MqttClient
 from upstream.device import Device
-from upstream.kills import make_device
-from upstream.peers import FleetMosquitto
+from upstream.kills import Fleet, make_device, make_fleet
 from upstream.relay import Relay
 
 Report = TypeVar("Report")
@@ -28,21 +27,24 @@ class Trial(Generic[Report]):
         report: Report,
         *,
         device: str = "appliance",
+        fleet: Fleet = "mosquitto",
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.directory = directory
         self.report = report
-        self.kind = device
+        self.kind, self.fleet_kind = device, fleet
         self.say = say
         self.device: Device
 
     def run(self) -> Report:
-        with FleetMosquitto(self.directory / "fleet") as fleet:
-            try:
-                asyncio.run(self._run(fleet.plain_port))
-            finally:
-                if hasattr(self, "device"):
-                    self.device.kill()
+        fleet = make_fleet(self.fleet_kind, self.directory / "fleet")
+        fleet.start()
+        try:
+            asyncio.run(self._run(fleet.plain_port))
+        finally:
+            if hasattr(self, "device"):
+                self.device.kill()
+            fleet.stop()
         return self.report
 
     async def _run(self, fleet: int) -> None:
@@ -54,7 +56,7 @@ class Trial(Generic[Report]):
 
     def make_device(self, remote: int) -> Device:
         """It connects to the port `remote`; it is not started."""
-        return make_device(self.kind, self.directory / "device", remote, "mosquitto", 100)
+        return make_device(self.kind, self.directory / "device", remote, self.fleet_kind, 100)
 
     async def dial(self, name: str) -> MqttClient:
         """A local client of the device."""
