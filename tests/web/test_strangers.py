@@ -118,7 +118,7 @@ def test_a_hundred_thousand_topics(
     with Peer(appliance, V5, user="stranger") as peer:
         for number in range(count):
             sent = peer.client.publish(f"other/{number}/many", b"1", qos=1)
-            if (number + 1) % 10_000 == 0:  # paho keeps 65,535
+            if (number + 1) % 1000 == 0:  # paho keeps 65,535
                 eventually(sent.is_published, f"{number} to be taken")
         page.wait_for_selector("[role=status]:has-text('more than can be kept')")
         page.click("button.fold[aria-expanded=false]:has-text('other')")
