@@ -24,6 +24,8 @@ class Links:
     ) -> None:
         #: Those that run, in the order of the file.
         self.running: list[Uplink] = []
+        #: Others, for which something is stored: they were removed, or have another name now.
+        self.left_behind: list[str] = []
         self._broker = broker
         self._entries = entries
         self._backlogs = backlogs
@@ -34,6 +36,7 @@ class Links:
         """Connect in the background."""
         for link in _wanted(settings):
             self._start(link)
+        self._find_left_behind()
 
     async def replace(self, settings: Settings) -> list[str]:
         """End the links that are not there any more, or are different, and start those of the
@@ -61,7 +64,13 @@ class Links:
         if not self._is_stopped:  # else there may be others than the wanted ones
             order = list(wanted)
             self.running.sort(key=lambda uplink: order.index(uplink.settings.name))
+        self._find_left_behind()
         return changed
+
+    def _find_left_behind(self) -> None:
+        """Only the start and the end of a link change it: what it takes time to find is kept."""
+        running = {uplink.settings.name for uplink in self.running}
+        self.left_behind = [name for name in self._backlogs.links() if name not in running]
 
     def _start_contained(self, link: UpstreamSettings, before: Uplink | None = None) -> None:
         """A fault of one link keeps no other one from its start."""

@@ -253,7 +253,7 @@ class App:
                 listeners,
                 store,
                 self.bridge,
-                self.upstreams,
+                self._links,
                 self._reload,
                 tls.warnings if tls is not None else list,
                 self._announcer,

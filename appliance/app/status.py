@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import partial
@@ -33,7 +33,7 @@ from appliance.store import SessionStore
 from appliance.upstream.status import warnings_of as upstream_warnings
 
 if TYPE_CHECKING:
-    from appliance.upstream.uplink import Uplink
+    from appliance.app.links import Links
 
 #: The part of a limit from which on its use is reported, with the users that hold most of it.
 NEARLY_FULL = 0.8
@@ -51,7 +51,7 @@ class StatusParts:
     listeners: Listeners
     store: SessionStore
     bridge: Bridge | None
-    upstreams: Sequence[Uplink]
+    links: Links
     reload: Reload
     warnings: Callable[[], list[str]]
     announcer: AnnouncerProcess
@@ -114,7 +114,7 @@ class Status:
             "ros": ros,
             "routes": routes,
             "mdns": parts.announcer.status(),
-            "upstreams": [uplink.status().as_json() for uplink in parts.upstreams],
+            "upstreams": [uplink.status().as_json() for uplink in parts.links.running],
             "reload": self._reload(),
             "errors": self._errors(),
         }
@@ -317,6 +317,12 @@ class Status:
         for upstream in report["upstreams"]:
             for text in upstream_warnings(upstream):
                 yield f"upstream {upstream['name']}: {text}"
+        for name in self._parts.links.left_behind:
+            yield (
+                f"messages wait for the upstream {name!r}, which is not in the file: give a link "
+                f"that name and they are sent, or stop the appliance and: appliance store prune "
+                f"--upstream {name}"
+            )
         if self._parts.crash is not None:
             yield f"the last run crashed, see {self._parts.crash}"
         errors = report["errors"]

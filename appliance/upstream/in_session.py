@@ -114,6 +114,8 @@ class InCounters:
     #: By the filter of their rule, there, those that were dealt with; and dropped ones, with why.
     came: Counter[str] = field(default_factory=Counter)
     dropped: Counter[tuple[str, Verdict]] = field(default_factory=Counter)
+    #: By the same filters, why the access rules let nothing through that came last.
+    denied: dict[str, str] = field(default_factory=dict)
 
 
 class _Came(NamedTuple):
@@ -331,8 +333,11 @@ class InSession:
         if self._is_kept and self._waits_for_ros(topic):
             return False
         message = self._message(came, topic)
-        is_dealt_with = self._deliver(came, message, self._session)
+        refused = self._counters.refused
+        is_dealt_with = self._deliver(came, message, self._session, rule)
         self._counters.came[rule.remote_filter] += is_dealt_with
+        if self._counters.refused > refused:
+            self._counters.dropped[rule.remote_filter, Verdict.REFUSED] += 1
         return is_dealt_with
 
     def _is_dropped(self, came: _Came, rule: InRule, topic: str) -> bool:
@@ -410,8 +415,13 @@ class InSession:
         message = Message(topic, packet.payload, packet.qos, properties_wire=packet.properties_wire)
         return self._deliver(came, message, self._answering)
 
-    def _deliver(self, came: _Came, message: Message, origin: Session) -> bool:
-        """Publish it as a session; False if it has to wait for its receivers or for decisions."""
+    def _deliver(
+        self, came: _Came, message: Message, origin: Session, rule: InRule | None = None
+    ) -> bool:
+        """Publish it as a session; False if it has to wait for its receivers or for decisions.
+
+        `rule` is the one that carries it, if it is no answer.
+        """
         packet, broker = came.packet, self._broker
         try:
             route = broker.route(origin, message.topic_wire)
@@ -438,6 +448,8 @@ class InSession:
         code: int = broker.publish_to(targets, route, message, origin)
         if message.rejection is not None:
             code, message.rejection = message.rejection.code, None
+        if rule is not None and not route.is_guarded:
+            self._note_right(rule, None if route.allowed else route.reason)
         if code >= 0x80:
             self._counters.refused += 1
             self._acknowledge_refusal(packet, code)
@@ -445,6 +457,13 @@ class InSession:
             self._counters.delivered += 1
             self._acknowledge(packet, ReasonCode.SUCCESS)
         return True
+
+    def _note_right(self, rule: InRule, denial: str | None) -> None:
+        """Whether the access rules let the link publish what a rule carries; for the status."""
+        if denial is not None:
+            self._counters.denied[rule.remote_filter] = denial
+        elif self._counters.denied:
+            self._counters.denied.pop(rule.remote_filter, None)
 
     # --- waiting -------------------------------------------------------------------------------
 

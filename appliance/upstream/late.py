@@ -34,6 +34,7 @@ class Verdict(Enum):
     REPEATED = "sent again"
     LATE = "late"
     RETAINED = "retained"
+    REFUSED = "refused"  # here: by the access rules, by a route to ROS, or for want of room
 
 
 def judge(

@@ -17,7 +17,9 @@ class LinkStatus:
     `held_back` messages wait for their receivers here, and `unacknowledged` ones are not
     acknowledged to the fleet's broker. `forgotten` ones were lost at reloads. `refused_filters` are
     of subscriptions that it refuses, `missing_filters` of those upon which it closes the
-    connection. `state_refusal` is why the fleet does not see whether the robot is online.
+    connection. `denied` says why the access rules here do not let it read a filter, and
+    `denied_inward` why they do not let it publish what came. `state_refusal` is why the fleet does
+    not see whether the robot is online.
     """
 
     name: str
@@ -53,6 +55,7 @@ class LinkStatus:
     refused_filters: list[str] = field(default_factory=list)
     missing_filters: list[str] = field(default_factory=list)
     denied: dict[str, str] = field(default_factory=dict)
+    denied_inward: dict[str, str] = field(default_factory=dict)
     state_refusal: str | None = None
     advice: str | None = None
 
@@ -71,6 +74,8 @@ def warnings_of(status: dict[str, Any]) -> Iterator[str]:
         yield status["advice"]
     for name, reason in status["denied"].items():
         yield f"the access rules do not let it read {name}: {reason}"
+    for name, reason in status["denied_inward"].items():
+        yield f"the access rules do not let it publish here what comes on {name}: {reason}"
     for name in status["refused_filters"]:
         yield f"the fleet's broker refuses the subscription to {name}"
     for name in status["missing_filters"]:

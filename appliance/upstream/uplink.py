@@ -454,6 +454,7 @@ class Uplink:
         status.missing_filters = [each for line in self._lines for each in line.missing_filters]
         status.forgotten = self._forgotten
         status.denied = dict(self._out.denied)
+        status.denied_inward = dict(self._in_counters.denied)
         status.state_refusal = self._state.refusal
         status.advice = bottleneck(status)
         return status

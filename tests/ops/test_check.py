@@ -259,6 +259,7 @@ def test_rules_for_nobody(here: Path) -> None:
     (here / "acl.conf").write_text("user alice\ntopic read a\nuser bob\ntopic read a\ntopic b\n")
     (finding,) = [each for each in found(here) if "no user" in each.text]
     assert finding.subject == "acl.conf:4" and "'bob'" in finding.text
+    assert finding.text.endswith("remove them, or: appliance user add bob")
 
 
 def test_rules_that_name_nothing(here: Path) -> None:

@@ -59,11 +59,36 @@ def test_a_link_that_is_right(here: Path) -> None:
     assert (finding.level, finding.subject) == ("ok", "upstream fleet")
     assert finding.text == ("mqtts://broker.example:8883, as user 'upstream'; rules: 1 out, 0 in")
     strangers = [
-        each.text
-        for each in check(config.load(here / "appliance.yaml"))
-        if "no user: a slip?" in each.text
+        each.text for each in check(config.load(here / "appliance.yaml")) if "no user" in each.text
     ]
     assert strangers == []  # nobody logs in as the link's user
+
+
+def test_a_slip_in_the_name_of_the_links_user(here: Path) -> None:
+    found(here, user="upstraem")
+    told = [each.text for each in check(config.load(here / "appliance.yaml"))]
+    (text,) = [each for each in told if "no user" in each]
+    assert "'upstream', who is no user, and the user of no link: did you mean 'upstraem'?" in text
+
+
+def test_files_of_the_fleet_that_are_not_there(here: Path) -> None:
+    """`appliance init` cannot make them."""
+    tls = {"ca": "nope.crt", "certificate": "no.crt", "key": "no.key"}
+    told = troubles(here, tls=tls)
+    assert [each.rpartition("; ")[2] for each in told] == [
+        "copy the fleet's CA certificate there",
+        *["the one that the fleet has made for this robot belongs there"] * 2,
+    ]
+    assert f"error tls.ca: there is no file {here / 'nope.crt'}" in told[0]
+
+
+def test_backlogs_that_the_disk_has_no_room_for(here: Path) -> None:
+    assert troubles(here, backlog={"size": "1 MiB"}) == []
+    (told,) = troubles(here, backlog={"size": "5000000 GiB"})
+    assert told.startswith(
+        "warning backlog.size of all links and broker.store.size are 5000001 GiB"
+    )
+    assert f"{here} has room for " in told
 
 
 def test_without_links_nothing_is_said(here: Path) -> None:

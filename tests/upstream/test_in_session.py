@@ -95,11 +95,19 @@ def test_what_no_rule_carries_is_not_published(rig: Rig) -> None:
 
 
 def test_the_access_rules_refuse(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    """Which is told by the rule that carries it, until they do not any more."""
     peer = rig.join()
     peer.subscribe("#")
-    assert rig.connect().send("fleet/r2/secret/x") == ReasonCode.NOT_AUTHORIZED
+    fleet, secret = rig.connect(), "fleet/r2/secret/#"
+    assert fleet.send("fleet/r2/secret/x") == ReasonCode.NOT_AUTHORIZED
     assert not peer.messages() and rig.counters.refused == 1
     assert "'_upstream_in.fleet' (user 'upstream') may not publish to 'r2/secret/x'" in caplog.text
+    assert rig.counters.dropped == {(secret, Verdict.REFUSED): 1}
+    assert list(rig.counters.denied) == [secret] and "acl.conf:" in rig.counters.denied[secret]
+    assert fleet.send("fleet/r2/cmd_vel") == 0 and rig.counters.denied  # another rule
+    rig.reload(ACL.replace("topic deny {robot}/secret/#", ""))
+    assert fleet.send("fleet/r2/secret/x") == 0
+    assert not rig.counters.denied and rig.counters.refused == 1
 
 
 @pytest.mark.parametrize("limits", [Limits(topic_levels=4), Limits(topic_length=20)])
@@ -134,7 +142,8 @@ def test_what_ros_cannot_use_is_refused(rig: Rig, said: ReasonCode, sent: Reason
     ear = hear(rig)
     ear.rejection = PublishRejection(said, "by the test")
     assert rig.connect().send("fleet/r2/cmd_vel") == sent
-    assert rig.counters.refused == 1
+    assert rig.counters.refused == 1 and not rig.counters.denied
+    assert rig.counters.dropped == {("fleet/r2/cmd_vel", Verdict.REFUSED): 1}
 
 
 def test_circles_are_dropped(rig: Rig) -> None:

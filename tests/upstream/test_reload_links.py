@@ -71,6 +71,37 @@ async def test_links_are_reloaded(tmp_path: Path) -> None:
             assert retained.get("r2d2/_appliance/upstream/second") is not None
 
 
+async def test_what_waits_for_a_link_that_has_another_name_now_is_told(tmp_path: Path) -> None:
+    async def told(rig: Rig) -> list[str]:
+        assert rig.app._status is not None
+        warnings = (await rig.app._status.report(None))["warnings"]
+        return [each for each in warnings if "not in the file" in each]
+
+    async with FakeFleet() as fleet:
+        rig = Rig(tmp_path, fleet.port)
+        (link,) = yaml.safe_load(rig.file.read_text())["upstreams"]
+        async with running(rig):
+            await rig.connected()
+            await rig.drained()
+            assert await reload(rig, {**link, "name": "central"}) and not await told(rig)
+            await reload(rig, link)
+            await rig.connected()
+            await fleet.stop()
+            await publish(rig, "r2d2/events/door", b"waits")
+            await reload(rig, {**link, "name": "central"})
+            (text,) = await told(rig)
+            assert "messages wait for the upstream 'fleet'" in text
+            assert text.endswith("appliance store prune --upstream fleet")
+        async with running(rig):  # at a start as well
+            assert await told(rig) == [text]
+            await reload(rig)
+            assert await told(rig) == [text]
+            await fleet.start()
+            await reload(rig, link)
+            await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == [b"waits"])
+            assert not await told(rig)
+
+
 async def test_what_is_said_of_a_link_ends_when_it_is_removed_before_a_start(
     tmp_path: Path,
 ) -> None:

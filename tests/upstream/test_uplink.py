@@ -175,6 +175,21 @@ async def test_online_and_offline_are_said_there_and_here(tmp_path: Path) -> Non
         assert fleet.visit.disconnect is not None
 
 
+async def test_what_the_access_rules_do_not_let_in_is_told(tmp_path: Path) -> None:
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await rig.connected()
+        acl = tmp_path / "acl.conf"
+        acl.write_text(acl.read_text() + "user upstream\ntopic deny {robot}/cmd/#\n")
+        await rig.app.reload()
+        (await fleet.visited()).message("fleet/r2d2/cmd/1", b"go")
+        await until(lambda: rig.status().refused)
+        status = rig.status().as_json()
+        (text,) = warnings_of(status)
+        assert text.startswith("the access rules do not let it publish here what comes on ")
+        assert "fleet/r2d2/cmd/#: " in text and "acl.conf:" in text
+        assert status["dropped"]["fleet/r2d2/cmd/#"] == {"refused": 1}
+
+
 async def test_a_refused_state_is_told_until_the_fleet_takes_it(tmp_path: Path) -> None:
     async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
         fleet.acknowledge = refuse(0x87, times=1)

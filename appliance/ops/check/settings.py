@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import logging
 import os
@@ -130,8 +131,11 @@ def _access(settings: Settings) -> Iterator[Finding]:
         strangers = {rule.user: rule for rule in reversed(rules.rules) if rule.user not in known}
         for name, first in strangers.items():
             if name:
+                near = difflib.get_close_matches(name, known, 1)
+                slip = f"did you mean {near[0]!r}? Else " if near else ""
                 text = (
-                    f"rules for {name!r}, who is no user: a slip? Else: appliance user add {name}"
+                    f"rules for {name!r}, who is no user, and the user of no link: {slip}remove "
+                    f"them, or: appliance user add {name}"
                 )
                 yield Finding("warning", f"{first.file}:{first.line}", text)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,6 +59,24 @@ def upstreams(settings: Settings) -> Iterator[Finding]:
         yield Finding("warning", "upstreams", text)
     if settings.broker.store.durability == "off":
         text = "broker.store.durability is off: what waits for a link ends with the process"
+        yield Finding("warning", "upstreams", text)
+    else:
+        yield from _disk(settings)
+
+
+def _disk(settings: Settings) -> Iterator[Finding]:
+    """Whether what may wait for all links has room beside what else is stored."""
+    store = settings.broker.store
+    directory = next(path for path in store.path.parents if path.exists())
+    stored = store.path.stat().st_size if store.path.exists() else 0
+    room = shutil.disk_usage(directory).free + stored
+    wanted = store.size + sum(link.backlog.size for link in settings.upstreams)
+    if wanted > room:
+        text = (
+            f"backlog.size of all links and broker.store.size are {format_size(wanted)}, and "
+            f"{directory} has room for {format_size(room)}: when the disk is full nothing is "
+            "stored any more, for the clients here either"
+        )
         yield Finding("warning", "upstreams", text)
 
 
@@ -131,17 +150,21 @@ def _files(link: UpstreamSettings) -> Iterator[Finding]:
             problem = _secret(path)
             if problem:
                 yield Finding("error", subject, f"{key}: {path} {problem}")
-    for key, path in (("tls.ca", link.tls.ca), ("tls.certificate", link.tls.certificate)):
+    own = "the one that the fleet has made for this robot belongs there"
+    for key, path, load, what in (
+        ("tls.ca", link.tls.ca, certs.load_certificates, "copy the fleet's CA certificate there"),
+        ("tls.certificate", link.tls.certificate, certs.load_certificates, own),
+        ("tls.key", link.tls.key, certs.load_key, own),
+    ):
+        if path is None:
+            continue
+        if not path.exists():
+            yield Finding("error", subject, f"{key}: there is no file {path}; {what}")
+            continue
         try:
-            if path is not None:
-                certs.load_certificates(path)
+            load(path)
         except certs.CertificateError as error:
             yield Finding("error", subject, f"{key}: {error}")
-    try:
-        if link.tls.key is not None:
-            certs.load_key(link.tls.key)
-    except certs.CertificateError as error:
-        yield Finding("error", subject, f"tls.key: {error}")
 
 
 def _secret(path: Path) -> str:
