@@ -11,6 +11,7 @@
     python tests/upstream --calls 1000 --ros              # and 100 goals
     python tests/upstream --faults 10
     python tests/upstream --faults 10 --fleet appliance   # which looks each second who is silent
+    python tests/upstream --hostile 5                     # a fleet's broker that does anything
     python tests/upstream --links 200                     # one RabbitMQ is killed and started
 
 The exit code is 1 when anything is wrong, 2 when a program is missing. The seed that is printed
@@ -34,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from upstream.calls import Calls
 from upstream.faults import Faults
+from upstream.hostile_fleet import HostileFleet
 from upstream.kills import FLEETS, Kills
 from upstream.late_commands import LateCommands
 from upstream.outage import Outage
@@ -56,6 +58,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     what.add_argument("--kills", type=int, metavar="N", help="kill at random so often, under load")
     what.add_argument("--outage", action="store_true", help="fill the backlog, then drain it")
     what.add_argument("--faults", type=float, metavar="MINUTES", help="random faults of the line")
+    what.add_argument("--hostile", type=float, metavar="MINUTES", help="a hostile fleet's broker")
     what.add_argument("--late", action="store_true", help="commands over a line that is silent")
     what.add_argument("--calls", type=int, metavar="N", help="calls from the fleet")
     what.add_argument("--links", type=int, metavar="N", help="so many reconnect at once")
@@ -112,6 +115,9 @@ def program(options: argparse.Namespace, directory: Path, say: Callable[[str], N
         fleet = options.fleet or "mosquitto"
         seconds = options.faults * 60
         return Faults(directory, options.seed, seconds=seconds, fleet=fleet, **common).run
+    if options.hostile is not None:
+        seconds = options.hostile * 60
+        return HostileFleet(directory, options.seed, seconds=seconds, say=say).run
     if options.ros:
         return ros_program(options, directory, common)
     if options.late:

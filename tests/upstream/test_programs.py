@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from waiting import PATIENCE
 
+from appliance.mqtt.packets import Packet, Publish
 from upstream import __main__ as program
-from upstream import calls, kills, late_commands, outage, reconnects
+from upstream import calls, fake_fleet, hostile_fleet, kills, late_commands, outage, reconnects
 from upstream.calls import Calls
 from upstream.device import count
+from upstream.fake_fleet import Visit
+from upstream.hostile_fleet import EVENTS, HostileFleet
 from upstream.kills import Kills
 from upstream.late_commands import LateCommands
 from upstream.outage import Outage
@@ -62,8 +67,59 @@ def test_links_that_take_too_long_to_come_back_are_told(
     assert ["5 links are online" in each for each in report.problems] == [True, True], report
 
 
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No misdeed takes long."""
+    known = hostile_fleet.SCENARIOS
+    brief = {name: each for name, each in known.items() if not each.slow}
+    monkeypatch.setattr(hostile_fleet, "SCENARIOS", brief)
+
+
+@pytest.mark.usefixtures("brief")
+def test_a_broker_that_does_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few seconds of it; `python tests/upstream --hostile 5` for minutes, and for pings."""
+    monkeypatch.setattr(hostile_fleet, "ANSWERED", PATIENCE)
+    report = HostileFleet(tmp_path, 1, seconds=6.0).run()
+    assert not report.problems, f"{report}\n" + "\n".join(report.problems)
+    assert report.steps > 1 and report.connections > 2
+    assert report.acknowledged > 50 and report.received >= report.acknowledged
+
+
+@pytest.mark.usefixtures("brief")
+def test_what_a_broker_loses_and_a_ping_that_waits_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hostile_fleet, "ANSWERED", 0.0)
+    monkeypatch.setitem(fake_fleet._HANDLERS, Publish, lose_some(Visit.on_publish))
+    report = HostileFleet(tmp_path, 1, seconds=2.0).run()
+    assert any("a local ping took" in each for each in report.problems)
+    assert any("LOST" in each for each in report.problems), report
+
+
+def lose_some(
+    take: Callable[[Visit, Publish], None],
+) -> Callable[[Visit, Packet], None]:
+    """The broker acknowledges every tenth message, and forgets it."""
+
+    def taken(visit: Visit, packet: Packet) -> None:
+        assert isinstance(packet, Publish)
+        take(visit, packet)
+        if packet.topic == EVENTS and int(packet.payload.split()[0]) % 10 == 0:
+            visit.fleet.published.remove(packet)
+            if packet.packet_id in visit.unacknowledged:
+                visit.acknowledge(packet.packet_id)
+
+    return taken
+
+
 def test_the_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    for arguments in (["--kills", "2"], ["--outage"], ["--late"], ["--calls", "5"]):
+    for arguments in (
+        ["--kills", "2"],
+        ["--outage"],
+        ["--late"],
+        ["--calls", "5"],
+        ["--hostile", "1"],
+    ):
         assert program.program(program.parse(arguments), tmp_path / arguments[0], print)
     with pytest.raises(SystemExit):
         program.parse([])
