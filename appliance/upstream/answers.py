@@ -185,7 +185,18 @@ class Answers:
         command to it, or for the answer of another call of it."""
         if topic.startswith(self._prefix) and "/_reply/" in topic:
             return True
-        return bool(self._own.match(topic))
+        if self._own.match(topic):
+            return True
+        # A rule may have a prefix of its own for calls.
+        above, _, token = topic.rpartition("/")
+        if not above.endswith("/_reply"):
+            return False
+        called = (above[: -len("_reply")] + last for last in (*_CALLS, "_set", "set"))
+        return any(
+            self._own.match(each) or self._own.match(f"{each}/{token}")
+            for each in called
+            if _is_call(each)
+        )
 
     def for_answer_out(self, topic: str, now: float) -> str | None:
         """The topic there of an answer that was published here; None when it is for nobody."""

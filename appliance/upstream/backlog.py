@@ -101,6 +101,9 @@ _LONGEST_EXPIRY: Final = 0xFFFF_FFFF
 MOST_HELD: Final = 10_000
 HELD_SHARE: Final = 1 / 4
 
+#: With `when_full: refuse`, the part of the room that is kept free for each more urgent lane.
+RESERVE_SHIFT: Final = 3
+
 
 class Backlog:
     """What waits for one link.
@@ -131,6 +134,8 @@ class Backlog:
         self._disk = DiskRoom(backlogs)
         self._wake = wake
         self._limits = limits
+        #: By lane, the bytes up to which a message has room.
+        self._room: list[int] = []
         self._bucket: TokenBucket | None = None
         self._byte_bucket: TokenBucket | None = None
         #: Numbers grow through restarts, as no link has a million messages a second.
@@ -216,6 +221,20 @@ class Backlog:
     def _sort(self) -> None:
         self._queues.sort()
         self._read_ahead.divide(len(self._queues.by_name))
+        self._divide()
+
+    def _divide(self) -> None:
+        """Say up to how many bytes a message of each lane has room.
+
+        Where nothing is dropped for what is more urgent, a part is kept free for it.
+        """
+        size = self._limits.size
+        reserve = size >> RESERVE_SHIFT if self._limits.when_full == "refuse" else 0
+        self._room = []
+        for queues in self._queues.lanes:
+            self._room.append(size)
+            if any(queue.configured for queue in queues):
+                size -= reserve
 
     # --- what was stored ------------------------------------------------------------------------
 
@@ -308,7 +327,7 @@ class Backlog:
         ):
             self._drop_unwritten(queue, now)
             return None
-        if self._tally.bytes + size > self._limits.size and not self._make_room(
+        if self._tally.bytes + size > self._room[queue.lane] and not self._make_room(
             queue, topic if kept == "latest" else None, size, now
         ):
             return self._refuse(queue)
@@ -350,12 +369,13 @@ class Backlog:
     def _make_room(self, queue: RuleQueue, latest: str | None, size: int, now: float) -> bool:
         """Whether the message has room, of which the latest of a topic takes that of the one before
         unless that is dropped meanwhile."""
+        room = self._room[queue.lane]
         while True:
             replaced = None if latest is None else queue.latest.get(latest)
             added = size if replaced is None else size - replaced.size
-            if self._tally.bytes + added <= self._limits.size:
+            if self._tally.bytes + added <= room:
                 return True
-            if not self._eviction.make_room(queue.lane, added, now):
+            if not self._eviction.make_room(queue.lane, added, now, room):
                 return False
             if replaced is None or queue.latest.get(replaced.topic) is replaced:
                 return True

@@ -77,13 +77,12 @@ class Eviction:
 
     # --- full -----------------------------------------------------------------------------------
 
-    def make_room(self, lane: int, size: int, now: float) -> bool:
-        """Drop until a message of the lane has room: too old ones, then the lowest lane's oldest,
-        in it the latest ones of who has more than a share of these first.
+    def make_room(self, lane: int, size: int, now: float, limit: int) -> bool:
+        """Drop until a message of the lane has room within the limit of bytes: too old ones, then
+        the lowest lane's oldest, in it the latest ones of who has more than a share of these first.
 
         Whatever is more urgent than the message stays. What takes too long is left to `go_on`.
         """
-        limit = self._limits.size
         if size > limit:
             return False
         is_all = self._drop_outdated(now)

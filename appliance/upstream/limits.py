@@ -32,7 +32,7 @@ class FleetLimits:
     retain: bool = True
     packet_size: int = LARGEST_PACKET
     topic_size: int = 65_535
-    topic_slashes: int | None = None
+    topic_slashes: int = 200  # mosquitto closes the connection upon more
     topic_aliases: int = 65_535
     filters: int | None = None
     client_id_size: int = 65_535
@@ -112,7 +112,7 @@ class FleetLimits:
         if len(counted.encode()) > self.topic_size:
             return f"a topic of {len(counted.encode())} bytes, and {self.topic_size} is the most"
         slashes = counted.count("/")
-        if self.topic_slashes is not None and slashes > self.topic_slashes:
+        if slashes > self.topic_slashes:
             return f"a topic with {slashes} slashes, and {self.topic_slashes} is the most"
         if not self.wildcards and ("+" in name or "#" in name):
             return "no wildcards in subscriptions"

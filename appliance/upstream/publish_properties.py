@@ -7,9 +7,20 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 from math import floor, inf
-from typing import Final
+from typing import Final, cast
 
-from appliance.mqtt.codec import Property, decode_varint, encode_string, encode_varint
+from appliance.mqtt.codec import (
+    NO_PROPERTIES,
+    PacketType,
+    Properties,
+    Property,
+    decode_properties,
+    decode_varint,
+    encode_properties,
+    encode_string,
+    encode_varint,
+)
+from appliance.mqtt.topics import holds_control
 
 #: User properties: what is the same each time a message is sent, and when it was published.
 ID: Final = "id"
@@ -39,6 +50,30 @@ class PublishProperties:
         #: from when until when they are the same.
         self._dated = self._published_with = b""
         self._since = self._until = inf
+        #: The last ones that were looked at, and what of them is sent.
+        self._looked_at = self._printable = NO_PROPERTIES
+
+    def printable(self, published: bytes) -> bytes:
+        """The properties without those that hold control characters.
+
+        A receiver may close the connection upon them (5.0 section 1.5.4), and mosquitto does, while
+        our clients are let use them.
+        """
+        if published == self._looked_at:
+            return self._printable
+        values, _ = decode_properties(published, 0, len(published), PacketType.PUBLISH)
+        kept: Properties = {}
+        for name, value in (values or {}).items():
+            if name is Property.USER_PROPERTY:
+                pairs = cast("list[tuple[str, str]]", value)
+                pairs = [each for each in pairs if not any(map(holds_control, each))]
+                if pairs:
+                    kept[name] = pairs
+            elif not (isinstance(value, str) and holds_control(value)):
+                kept[name] = value
+        self._looked_at = published
+        self._printable = published if kept == (values or {}) else encode_properties(kept)
+        return self._printable
 
     def encode(
         self, published: bytes, expiry: int | None, number: int | None, published_at: float | None

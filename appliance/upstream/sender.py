@@ -66,6 +66,10 @@ PATIENCE_UNANSWERED: Final = 200
 CLOSED_ON: Final = 3
 WITHOUT_PROGRESS: Final = 2
 
+#: A message that the broker has refused so often, not for want of room, is set aside: that takes
+#: ten minutes.
+MOST_REFUSED: Final = 15
+
 #: What stands for messages with QoS 0 among the suspects: no topic is empty. Connections that end
 #: without any other message count together when they do so within these seconds.
 UNANSWERED: Final = ""
@@ -190,7 +194,7 @@ class Sender:
             return
         properties = NO_PROPERTIES
         if is_v5:
-            properties = record.properties_wire
+            properties = self._properties.printable(record.properties_wire)
             at, number = entry.published_at, record.number if record.qos == 2 else None
             if at is not None:
                 at = None if offset is None else at + offset
@@ -254,6 +258,9 @@ class Sender:
                 text = f"{text}, {quote(reason)}" if reason else text
                 advice = message_advice(code, self._settings, entry.record.topic)
                 self._set_aside(entry, f"{text}: {advice}" if advice else text)
+            elif code != ReasonCode.QUOTA_EXCEEDED and entry.attempts >= MOST_REFUSED:
+                text = f"the fleet's broker has refused it {entry.attempts} times, the last time: "
+                self._set_aside(entry, text + reason_words(code))
             else:
                 self._backlog.retry_later(entry, self._clock())
 

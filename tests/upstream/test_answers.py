@@ -59,6 +59,24 @@ def test_an_answer_is_not_taken_for_that_of_another_call() -> None:
     assert answers.for_request_in("fleet/r2/get", "fleet/r2/get/_reply/1", 0.0) is None
 
 
+@pytest.mark.parametrize("kind", ["_call", "_goal", "_cancel", "_param/_set", "_param/x/set"])
+def test_an_answer_is_not_taken_for_that_of_a_call_below_a_prefix_of_its_own(kind: str) -> None:
+    answers = Answers(
+        link(
+            'in: [{topic: reset/_call, remote_prefix: "vehicles/7/"},'
+            f' {{topic: other/{kind}/+, remote_prefix: "vehicles/7/"}}]'
+        )
+    )
+    there = kind.rpartition("/")[0]
+    other = f"vehicles/7/other/{there and there + '/'}_reply/42"
+    assert reply_topic(f"vehicles/7/other/{kind}/42") == other
+    for call in ("vehicles/7/reset/_call", "fleet/r2/reset/_call"):
+        assert answers.for_request_in(call, other, 0.0) is None
+        assert answers.for_request_in(call, "vehicles/8/other/_reply/42", 0.0)
+    assert answers.for_request_in("vehicles/7/reset/_call", "vehicles/7/reset/_reply/1", 0.0)
+    assert answers.for_request_in(f"vehicles/7/other/{kind}/42", other, 0.0)
+
+
 def test_rules_that_came_later_hold_for_answers_too() -> None:
     answers = Answers(link("in: [{topic: reset/_call}]"))
     here = [

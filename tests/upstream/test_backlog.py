@@ -697,6 +697,21 @@ def test_full_and_refuse(caplog: pytest.LogCaptureFixture) -> None:
     assert link.drain() == ["new"]
 
 
+def test_full_and_refuse_leaves_room_for_what_is_more_urgent() -> None:
+    link = Link(
+        rule("alarms/#", priority="high"),
+        rule("logs/#", priority="low"),
+        size=80_000,
+        when_full="refuse",
+    )
+    said = [link.offer(bytes(1000), of=1) for _ in range(100)]
+    most = 80_000 - 80_000 // 8
+    assert most - 1200 < link.counts().bytes <= most and said[0] is None and said[-1]
+    said = [link.offer(bytes(1000)) for _ in range(20)]
+    assert said[0] is None and said[-1], "all of it is for alarms"
+    assert 80_000 - 1200 < link.counts().bytes <= 80_000
+
+
 def test_what_cannot_be_stored_is_refused() -> None:
     link = Link()
     link.backlogs.failing = True

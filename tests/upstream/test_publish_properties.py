@@ -9,6 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from appliance.mqtt.codec import (
+    NO_PROPERTIES,
     Properties,
     Property,
     decode_varint,
@@ -74,3 +75,21 @@ def test_times_that_follow_each_other(start: float, step: float) -> None:
         expiry = 7 if place % 10 == 9 else None
         at = start - 3.01e-5 + place * step
         assert properties.encode(published, expiry, None, at) == slow(published, expiry, None, at)
+
+
+def test_properties_that_hold_control_characters_are_left_out() -> None:
+    good: Properties = {
+        Property.CONTENT_TYPE: "text/plain",
+        Property.CORRELATION_DATA: b"\x01\x7f",
+        Property.USER_PROPERTY: [("a", "b"), ("ä", "")],
+    }
+    bad: Properties = {
+        **good,
+        Property.CONTENT_TYPE: "\x85",
+        Property.USER_PROPERTY: [("a", "b"), ("c\x01", "d"), ("ä", ""), ("c", "\ufffe")],
+    }
+    assert PROPERTIES.printable(NO_PROPERTIES) == NO_PROPERTIES
+    for _ in range(2):
+        plain = {name: good[name] for name in good if name != Property.CONTENT_TYPE}
+        for said, sent in ((good, good), (bad, plain), ({Property.CONTENT_TYPE: "\n"}, {})):
+            assert PROPERTIES.printable(encode_properties(said)) == encode_properties(sent)

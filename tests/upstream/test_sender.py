@@ -147,3 +147,29 @@ def test_a_flood_that_is_refused_is_not_a_flood_of_lines(caplog: pytest.LogCaptu
     sender.tick()
     assert f"{100 - BURST} more of this kind, the last: upstream 'fleet'" in caplog.messages[-1]
     assert link.counts().set_aside == 101
+
+
+@pytest.mark.parametrize(("code", "tries", "aside"), [(0x83, 15, 1), (0x80, 15, 1), (0x97, 40, 0)])
+def test_what_is_refused_again_and_again_is_set_aside(code: int, tries: int, aside: int) -> None:
+    """But for want of room, which there may be later."""
+    link = Link()
+    link.offer("x")
+    sender = sender_of(link)
+    sender.begin(FleetLimits())
+    tried = 0
+    for _ in range(40):
+        link.backlogs.time += 100
+        for entry in link.take():
+            tried += 1
+            sender.acknowledged([entry], code, "")
+    counts = link.backlog.counts()
+    assert (tried, counts.aside, counts.waiting) == (tries, aside, 1 - aside)
+
+
+def test_topics_that_mosquitto_would_close_upon_are_set_aside() -> None:
+    link = Link()
+    link.offer("x", "/" * 201)
+    link.offer("x", "/" * 200)
+    assert [topic for topic, _, _ in send(link)] == ["/" * 200]
+    (aside,) = link.backlog.aside()
+    assert "a topic with 201 slashes, and 200 is the most" in aside.reason

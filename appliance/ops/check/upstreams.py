@@ -244,6 +244,7 @@ def _calls(link: UpstreamSettings) -> Iterator[Finding]:
 def _too_long(link: UpstreamSettings) -> Iterator[Finding]:
     """Filters that the broker cannot take, and filters of topics some of which it cannot."""
     subject, limits = _subject(link), KINDS[link.kind]
+    takes_few_levels = limits.topic_slashes < KINDS["generic"].topic_slashes
     own = max(link.state_there, f"{link.answers_there}{new_token()}", key=limits.unusable)
     if limits.unusable(own):
         text = f"prefix: the link's own topic {own} is {limits.unusable(own)} there"
@@ -254,7 +255,7 @@ def _too_long(link: UpstreamSettings) -> Iterator[Finding]:
             if problem:
                 text = f"{direction} {rule.topic}: {rule.remote_filter} is {problem} there"
                 yield Finding("error", subject, text)
-            elif direction == "out" and limits.topic_slashes and rule.topic.endswith("#"):
+            elif direction == "out" and takes_few_levels and rule.topic.endswith("#"):
                 text = (
                     f"out {rule.topic}: topics there with more than {limits.topic_slashes} "
                     "slashes are set aside"
