@@ -11,7 +11,15 @@ import sys
 from array import array
 from collections.abc import Sequence
 
-from appliance.mqtt.codec import V5, V311, PacketType, Property
+from appliance.mqtt.codec import (
+    V5,
+    V311,
+    PacketType,
+    Property,
+    decode_packet_id,
+    decode_string,
+    find_topic_alias,
+)
 from appliance.mqtt.framing import (
     DEFAULT_PAIRS,
     MAXIMUM_CONNECT,
@@ -24,6 +32,7 @@ from appliance.mqtt.framing import (
     PacketFramer,
     State,
     check_type,
+    cost_of,
 )
 from appliance.mqtt.packets import (
     Auth,
@@ -33,10 +42,13 @@ from appliance.mqtt.packets import (
     Packet,
     Puback,
     Pubcomp,
+    Publish,
     Pubrec,
     Pubrel,
+    UnusablePublish,
 )
-from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.reason import ContentError, ProtocolError, ReasonCode
+from appliance.mqtt.topics import check_topic
 
 # The packets that a server may send in each state; any other is a protocol error (0x82).
 # DISCONNECT and AUTH exist in version 5 only, AUTH only after an authentication method. The
@@ -198,6 +210,32 @@ class ClientProtocol(PacketFramer):
         elif isinstance(packet, Disconnect):
             self.close()  # [MQTT-3.14.4-1]: it sends nothing after it
         return packet
+
+    def _publish(self, first: int, body: bytes) -> Publish:
+        try:
+            return super()._publish(first, body)
+        except ContentError as error:
+            return self._unusable(first, body, str(error))
+
+    def _unusable(self, first: int, body: bytes, flaw: str) -> UnusablePublish:
+        """A message with a ContentError: an end would let its publisher cut off who reads it."""
+        size = len(body)
+        self.cost = cost_of(size, size)
+        topic, pos = decode_string(body, 0)
+        packet_id = None
+        if first & 6:
+            packet_id, pos = decode_packet_id(PacketType.PUBLISH, body, pos)
+        alias = find_topic_alias(body, pos, size)
+        if topic:
+            try:
+                check_topic(topic)
+            except ValueError as error:
+                raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+        if alias is not None:
+            topic = self._resolve(alias, topic)
+        return UnusablePublish(
+            topic, b"", first >> 1 & 3, bool(first & 1), first >= 0x38, packet_id, flaw=flaw
+        )
 
     def _on_connack(self, connack: Connack) -> None:
         if connack.reason_code:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Final, TypeAlias, cast
 
-from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.reason import ContentError, ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
 V31: Final = 3
@@ -449,6 +449,42 @@ def read_properties(
     return (checked.values or None) if checked is not None else None, pos
 
 
+def find_topic_alias(buf: bytes, pos: int, end: int) -> int | None:
+    """The Topic Alias among the properties at `pos` of a PUBLISH that ends at `end`.
+
+    Nothing is checked but where each property ends: for those in which there is a ContentError.
+    """
+    stop, pos = _property_section(buf, pos, end)
+    buf = buf[:stop]  # so that a truncated value is not completed by later bytes
+    while pos < stop:
+        known = _KNOWN.get(buf[pos])
+        if known is None:
+            raise malformed(f"unknown property 0x{buf[pos]:02x}")
+        name, rule = known
+        pos += 1
+        if name is Property.TOPIC_ALIAS:
+            return decode_uint16(buf, pos)[0]
+        kind = rule.kind
+        if kind is Kind.STRING_PAIR:
+            pos = _skip(buf, _skip(buf, pos, stop), stop)
+        elif kind is Kind.STRING or kind is Kind.BINARY:
+            pos = _skip(buf, pos, stop)
+        elif kind is Kind.VARINT:
+            pos = decode_varint(buf, pos)[1]
+        else:
+            pos += kind.value  # which is its size
+    if pos > stop:
+        raise malformed("the packet ends inside a property")
+    return None
+
+
+def _skip(buf: bytes, pos: int, stop: int) -> int:
+    """The index behind the string or the binary data at `pos`."""
+    if pos + 2 > stop:
+        raise malformed("the packet ends inside a Two Byte Integer")
+    return pos + 2 + (buf[pos] << 8 | buf[pos + 1])
+
+
 def _property_section(buf: bytes, pos: int, end: int) -> tuple[int, int]:
     """Where the properties at `pos` end, and where the first of them begins."""
     length, pos = decode_varint(buf, pos)
@@ -479,7 +515,7 @@ def _too_many_pairs(limit: int) -> ProtocolError:
     0x97 is there for "an implementation or administrative imposed limit", in CONNACK as in
     DISCONNECT (5.0 sections 3.2.2.2 and 3.14.2.1).
     """
-    return ProtocolError(ReasonCode.QUOTA_EXCEEDED, f"more than {limit} User Properties")
+    return ContentError(ReasonCode.QUOTA_EXCEEDED, f"more than {limit} User Properties")
 
 
 def _check_string(buf: bytes, pos: int, stop: int) -> int:
@@ -509,7 +545,8 @@ def _decode_property(
             try:
                 check_topic(text)  # v5 [MQTT-3.3.2-14]
             except ValueError as error:
-                raise protocol_error(f"response topic: {error}") from error
+                text = f"response topic: {error}"
+                raise ContentError(ReasonCode.PROTOCOL_ERROR, text) from error
         properties[identifier] = text
         return pos
     if kind is Kind.BINARY:

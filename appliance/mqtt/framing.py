@@ -324,10 +324,10 @@ class PacketFramer:
     def _publish(self, first: int, body: bytes) -> Publish:
         """Decode a PUBLISH fully, resolve its topic alias and check its topic."""
         most = self.user_properties
-        self.cost = _cost(most, len(body))
+        self.cost = cost_of(most, len(body))
         packet = decode_packet(first, body, self.version, most)
         assert isinstance(packet, Publish)
-        self.cost = _cost(most, len(packet.passed_on))
+        self.cost = cost_of(most, len(packet.passed_on))
         properties = packet.properties
         if (
             properties
@@ -339,28 +339,34 @@ class PacketFramer:
             )
         alias = properties.pop(Property.TOPIC_ALIAS, None) if properties else None
         if isinstance(alias, int):
-            if alias > self.topic_alias_maximum:  # [MQTT-3.1.2-26] [MQTT-3.3.2-9]
-                raise ProtocolError(
-                    ReasonCode.TOPIC_ALIAS_INVALID,
-                    f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
-                )
-            if packet.topic:
-                before = self._aliases.get(alias)
-                self._aliased += text_size(packet.topic)
-                self._aliased += -text_size(before) if before is not None else ALIAS_SIZE
-                self._aliases[alias] = packet.topic
-            elif alias in self._aliases:  # and was checked when it was given
-                packet.topic = self._aliases[alias]
+            is_given = packet.topic != ""
+            packet.topic = self._resolve(alias, packet.topic)
+            if not is_given:  # it was checked when it was given
                 return packet
-            else:
-                raise ProtocolError(
-                    ReasonCode.PROTOCOL_ERROR, f"topic alias {alias} was never given a topic"
-                )
         try:
             check_topic(packet.topic)  # [MQTT-3.3.2-2], [MQTT-4.7.3-1]
         except ValueError as error:
             raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         return packet
+
+    def _resolve(self, alias: int, topic: str) -> str:
+        """The topic that the alias stands for; it is given one if there is any. ProtocolError."""
+        if not 0 < alias <= self.topic_alias_maximum:  # [MQTT-3.1.2-26] [MQTT-3.3.2-8, -9]
+            raise ProtocolError(
+                ReasonCode.TOPIC_ALIAS_INVALID,
+                f"topic alias {alias}, more than the {self.topic_alias_maximum} allowed",
+            )
+        before = self._aliases.get(alias)
+        if topic:
+            self._aliased += text_size(topic)
+            self._aliased += -text_size(before) if before is not None else ALIAS_SIZE
+            self._aliases[alias] = topic
+            return topic
+        if before is None:
+            raise ProtocolError(
+                ReasonCode.PROTOCOL_ERROR, f"topic alias {alias} was never given a topic"
+            )
+        return before
 
     def _check_size(self, kind: PacketType, size: int, limit: int) -> None:
         """Raise ProtocolError if a packet other than PUBLISH is larger than `limit` bytes."""
@@ -373,13 +379,13 @@ class PacketFramer:
 
     def _decode_packet(self, first: int, body: bytes, most: int) -> Packet:
         """Decode a packet other than PUBLISH, with at most `most` User Properties."""
-        self.cost = _cost(most, len(body))  # remains if decoding raises
+        self.cost = cost_of(most, len(body))  # remains if decoding raises
         packet = decode_packet(first, body, self.version, most)
-        self.cost = _cost(most, _properties_size(first >> 4, body, self.version))
+        self.cost = cost_of(most, _properties_size(first >> 4, body, self.version))
         return packet
 
 
-def _cost(most: int, size: int) -> int:
+def cost_of(most: int, size: int) -> int:
     """The cost of checking properties of `size` bytes with at most `most` User Properties."""
     return min(most, size // SHORTEST_PAIR) // 2 + (size >> 9)
 

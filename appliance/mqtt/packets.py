@@ -184,6 +184,13 @@ _A = TypeVar("_A", bound="_Acknowledgement")
 
 
 @dataclass(slots=True)
+class UnusablePublish(Publish):
+    """A PUBLISH with a ContentError, without its payload and properties; `flaw` says what it is."""
+
+    flaw: str = ""
+
+
+@dataclass(slots=True)
 class _Acknowledgement:
     """What PUBACK, PUBREC, PUBREL and PUBCOMP have in common; 3.1.1 has the packet id only."""
 

@@ -71,6 +71,13 @@ class ProtocolError(Exception):
         self.notify_peer = notify_peer
 
 
+class ContentError(ProtocolError):
+    """What a publisher has put into a message is wrong, where the packet itself is in order.
+
+    A server may have passed it on as it was: whose fault it is, only the publisher's server knows.
+    """
+
+
 # 3.1.1 has five refusals (table 3.1). 3, "server unavailable", invites the client to try again;
 # 5, "not authorized", does not.
 _CONNACK_V311 = {

@@ -299,6 +299,9 @@ class InSession:
             reason = "too much waits for its receivers here"
             self._refuse(packet, ReasonCode.QUOTA_EXCEEDED, reason)
             return True
+        if packet.flaw:
+            self._refuse(packet, ReasonCode.UNSPECIFIED_ERROR, packet.flaw)
+            return True
         # It is split and checked again at each step, and an alias of two bytes may stand for it.
         self._broker.counters.cost += len(packet.topic) >> TOPIC_SHIFT
         if packet.topic.count("/") >= self._broker.limits.topic_levels + self._prefixed:

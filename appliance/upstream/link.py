@@ -50,6 +50,7 @@ from appliance.mqtt.packets import (
     Subscription,
     Unsuback,
     Unsubscribe,
+    UnusablePublish,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic, parse_shared
@@ -685,6 +686,7 @@ class FleetConnection(Generic[T]):
             packet.properties or None,
             packet.passed_on,
             not_before,
+            packet.flaw if isinstance(packet, UnusablePublish) else "",
         )
 
     def _expects(self, packet_id: int, qos: int, dup: bool) -> bool:

@@ -50,6 +50,7 @@ class Arrived:
     `properties` are those but the User Properties; `properties_wire` has all that may be passed on,
     encoded, see `CheckedProperties`. `not_before` is a time of this computer before which it did
     not leave the broker, nor, with QoS 1, was published there; minus infinity if there is none.
+    With a `flaw` it cannot be used, and is to be refused.
     """
 
     topic: str
@@ -61,6 +62,7 @@ class Arrived:
     properties: Properties | None
     properties_wire: bytes
     not_before: float
+    flaw: str = ""
 
 
 @dataclass(slots=True)

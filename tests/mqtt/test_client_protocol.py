@@ -23,7 +23,13 @@ from test_connection import (
 from test_properties import packets, publishes
 
 from appliance.mqtt.client_protocol import ClientProtocol
-from appliance.mqtt.codec import Property, encode_varint
+from appliance.mqtt.codec import (
+    Properties,
+    Property,
+    encode_properties,
+    encode_varint,
+    find_topic_alias,
+)
 from appliance.mqtt.framing import (
     DEFAULT_PAIRS,
     MAXIMUM_CONNECT,
@@ -43,6 +49,7 @@ from appliance.mqtt.packets import (
     Publish,
     Pubrec,
     Suback,
+    UnusablePublish,
     decode_packet,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
@@ -369,7 +376,9 @@ def test_control_packets_are_small():
     ids=lambda packet: packet.TYPE.name,
 )
 def test_user_properties_are_counted_and_not_decoded(packet):
-    for count, expected in ((DEFAULT_PAIRS, type(packet)), (DEFAULT_PAIRS + 1, ReasonCode)):
+    # Those of a message are its publisher's: it alone is refused.
+    many = UnusablePublish if isinstance(packet, Publish) else ReasonCode
+    for count, expected in ((DEFAULT_PAIRS, type(packet)), (DEFAULT_PAIRS + 1, many)):
         packet.properties = {Property.USER_PROPERTY: [("a", "b")] * count}
         client = connected()
         (found,) = client_events(client, packet.encode(5))
@@ -529,3 +538,63 @@ def test_pubacks_of_messages_that_nobody_subscribes_to_are_taken_at_once(end: by
     assert rest == b"\x40\x02\x00\x01"
     old = connected(4)
     assert old.take_pubacks(data) == ((), 0, data)  # of 3.1.1, which has no reason codes
+
+
+FLAWS: list[tuple[Properties, str]] = [
+    (
+        {Property.USER_PROPERTY: [("a", "b")] * (DEFAULT_PAIRS + 1)},
+        "more than 1000 User Properties",
+    ),
+    ({Property.RESPONSE_TOPIC: "a/#"}, "response topic: "),
+    ({Property.RESPONSE_TOPIC: ""}, "response topic: "),
+]
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+@pytest.mark.parametrize(("properties", "flaw"), FLAWS)
+def test_what_a_publisher_has_put_in_ends_no_connection(
+    qos: int, properties: Properties, flaw: str
+) -> None:
+    """Its server may pass it on as it is; a server itself refuses it."""
+    client, server = connected(), Publish("t", b"x", properties=properties).encode(5)
+    packet_id = 7 if qos else None
+    for said_first in (
+        {Property.TOPIC_ALIAS: 3, **properties},
+        {**properties, Property.TOPIC_ALIAS: 3},
+    ):
+        packet = Publish("t", b"x", qos, packet_id=packet_id, properties=said_first)
+        (event,) = said(client, [packet.encode(5)])
+        assert isinstance(event, UnusablePublish) and event.flaw.startswith(flaw)
+        assert (event.topic, event.qos, event.packet_id) == ("t", qos, packet_id)
+        assert not event.payload and event.properties is None
+        again = Publish("", b"y", properties={Property.TOPIC_ALIAS: 3})
+        assert [each.topic for each in said(client, [again.encode(5)])] == ["t"]
+    with pytest.raises(ProtocolError):
+        decode_packet(
+            server[0], server[1 + len(encode_varint(len(server) - 2)) :], 5, DEFAULT_PAIRS
+        )
+
+
+@pytest.mark.parametrize(
+    "more", [b"\x7f", b"\x23\0\0", b"\x23\0", b"\x23\0\x63", b"\x26\0", b"\x26\0\1a\0\5"]
+)
+def test_a_packet_that_is_wrong_as_well_ends_it(more: bytes) -> None:
+    """An unknown property, an alias of 0 or above the maximum, and one that is cut off."""
+    wrong = b"\x08\0\3a/#" + more
+    body = b"\0\1t" + encode_varint(len(wrong)) + wrong
+    (code,) = said(connected(), [b"\x30" + encode_varint(len(body)) + body])
+    assert isinstance(code, ReasonCode)
+
+
+@pytest.mark.parametrize("topic", ["a/+", "\x85"])
+def test_a_topic_that_is_wrong_as_well_ends_it(topic: str) -> None:
+    wrong: Properties = {Property.RESPONSE_TOPIC: "#", Property.TOPIC_ALIAS: 3}
+    (code,) = said(connected(), [Publish(topic, b"", properties=wrong).encode(5)])
+    assert code == ReasonCode.MALFORMED_PACKET
+
+
+@given(publishes(5))
+def test_the_alias_is_found(packet: Publish) -> None:
+    data = encode_properties(packet.properties)
+    alias = (packet.properties or {}).get(Property.TOPIC_ALIAS)
+    assert find_topic_alias(data, 0, len(data)) == alias

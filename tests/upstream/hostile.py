@@ -404,13 +404,29 @@ def _client_packet(visit: Visit, sent: object) -> None:
         "alias-never-set": raw_publish(0, b"", b"\x03\x23\x00\x01x"),
         "alias-too-high": raw_publish(0, b"a", b"\x03\x23\xff\xffx"),
         "subscription-identifier-0": raw_publish(0, b"a", b"\x02\x0b\x00x"),
-        "response-topic-wildcard": raw_publish(0, b"a", b"\x06\x08\x00\x03a/#x"),
         "payload-format-2": raw_publish(0, b"a", b"\x02\x01\x02x"),
         "garbage": bytes(range(0x31, 0x100)) * 4,
     },
 )
 def _bytes(visit: Visit, sent: object) -> None:
     """Bytes that are no packet of MQTT, or a malformed one."""
+    visit.send(sent)  # type: ignore[arg-type]
+
+
+@variants(
+    "subscribed",
+    "stays",
+    "unusable",
+    {
+        "response-topic-wildcard": raw_publish(0, b"a", b"\x06\x08\x00\x03a/#x"),
+        "response-topic-empty": raw_publish(2, b"a", b"\0\7\x03\x08\x00\x00x"),
+        "many-user-properties": Publish(
+            "a", b"x", 1, packet_id=7, properties={Property.USER_PROPERTY: [("a", "b")] * 1001}
+        ),
+    },
+)
+def _unusable(visit: Visit, sent: object) -> None:
+    """A message that a publisher may have made so: the broker passes it on as it is."""
     visit.send(sent)  # type: ignore[arg-type]
 
 

@@ -18,7 +18,7 @@ from waiting import until
 from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.host import clock
-from appliance.mqtt.codec import V311, Property
+from appliance.mqtt.codec import V311, Properties, Property
 from appliance.mqtt.packets import (
     Connack,
     Disconnect,
@@ -188,6 +188,23 @@ async def test_what_the_access_rules_do_not_let_in_is_told(tmp_path: Path) -> No
         assert text.startswith("the access rules do not let it publish here what comes on ")
         assert "fleet/r2d2/cmd/#: " in text and "acl.conf:" in text
         assert status["dropped"]["fleet/r2d2/cmd/#"] == {"refused": 1}
+
+
+@pytest.mark.parametrize("qos", [0, 1, 2])
+async def test_what_a_strangers_message_holds_ends_no_link(tmp_path: Path, qos: int) -> None:
+    """Retained, or kept in a session there, it would end each connection."""
+    bad: Properties = {Property.RESPONSE_TOPIC: "a/+/x"}
+    async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
+        await rig.connected()
+        visit = await fleet.visited()
+        for _ in range(3):
+            visit.message("fleet/r2d2/cmd/1", b"bad", qos, properties=bad, retain=True)
+        visit.message("fleet/r2d2/cmd/1", b"good", qos)
+        await until(lambda: rig.status().delivered == 1)
+        await until(lambda: not visit.sent)
+        assert (rig.status().refused, rig.status().connections) == (3, 1)
+        codes = [code for _, code in visit.acknowledged]
+        assert codes == ([0x80] * 3 + [0] if qos else []) and not fleet.faults
 
 
 async def test_a_refused_state_is_told_until_the_fleet_takes_it(tmp_path: Path) -> None:
