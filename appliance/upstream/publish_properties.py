@@ -59,6 +59,8 @@ class PublishProperties:
         A receiver may close the connection upon them (5.0 section 1.5.4), and mosquitto does, while
         our clients are let use them.
         """
+        if len(published) == 1:  # there are none
+            return published
         if published == self._looked_at:
             return self._printable
         values, _ = decode_properties(published, 0, len(published), PacketType.PUBLISH)
