@@ -137,6 +137,8 @@ def test_users(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None
     """A user is added, may do what its groups may, gets another password, and is removed."""
     visited = visit(**DESKTOP)
     page = visited.sign_in(page="Access")
+    # The list moves what is below it when it comes, also between the two halves of a click.
+    page.wait_for_selector("[role=region][aria-label=Users]")
     page.click("summary:has-text('Add a user')")
     add = page.locator("details:has(summary:has-text('Add a user')) form")
     add.locator("input[name=user]").fill("bob <b>")
