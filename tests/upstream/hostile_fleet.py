@@ -329,8 +329,8 @@ class HostileFleet:
         report.set_aside = status["set_aside"]
         if len(source.acknowledged - set(numbers)) > report.set_aside:
             report.problems += account.loss(EVENTS, source.acknowledged, numbers)
-        ordered = [number for number in numbers if number not in self.put_off]
-        report.problems += account.order(EVENTS, ordered, report.connections)
+        if not self.put_off:  # else what was put off, and what waited with it, comes behind others
+            report.problems += account.order(EVENTS, numbers, report.connections)
         report.problems += account.inventions(EVENTS, source.sent, numbers)
         report.problems += account.growth(report.memory, GROWTH)
         if "Traceback" in self.device.log:
