@@ -226,7 +226,7 @@ class ClientProtocol(PacketFramer):
         if first & 6:
             packet_id, pos = decode_packet_id(PacketType.PUBLISH, body, pos)
         alias = find_topic_alias(body, pos, size)
-        if topic:
+        if topic or alias is None:
             try:
                 check_topic(topic)
             except ValueError as error:

@@ -74,7 +74,8 @@ class Entry:
 
     `qos` is that of the PUBLISH to be sent, 0 or 1. `expiry` is its Message Expiry Interval.
     `published_at` is when it was published, in seconds of the journal's clock, if that is over a
-    second ago. `attempts` says how often it was handed out, this time included.
+    second ago. `attempts` says how often it was handed out, this time included, and `refused` how
+    often the fleet's broker has refused it, not for want of room.
     """
 
     __slots__ = (
@@ -87,6 +88,7 @@ class Entry:
         "qos",
         "queue",
         "record",
+        "refused",
         "size",
         "state",
         "value",
@@ -101,6 +103,7 @@ class Entry:
         self.expiry: int | None = None
         self.published_at: float | None = None
         self.attempts = 0
+        self.refused = 0
         self.state = IN_FLIGHT
         #: Where it is stored: in the journal, as a row of its own, or not at all.
         self.part: HeldSegment | None = None

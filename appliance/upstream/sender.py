@@ -258,8 +258,11 @@ class Sender:
                 text = f"{text}, {quote(reason)}" if reason else text
                 advice = message_advice(code, self._settings, entry.record.topic)
                 self._set_aside(entry, f"{text}: {advice}" if advice else text)
-            elif code != ReasonCode.QUOTA_EXCEEDED and entry.attempts >= MOST_REFUSED:
-                text = f"the fleet's broker has refused it {entry.attempts} times, the last time: "
+                continue
+            if code != ReasonCode.QUOTA_EXCEEDED:
+                entry.refused += 1
+            if entry.refused >= MOST_REFUSED:
+                text = f"the fleet's broker has refused it {entry.refused} times, the last time: "
                 self._set_aside(entry, text + reason_words(code))
             else:
                 self._backlog.retry_later(entry, self._clock())

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from appliance_process import ROBOT
 from raw_client import RawClient
 from waiting import until
 
@@ -116,8 +115,8 @@ class HostileFleet:
         self.random = random.Random(seed)
         self.say = say
         self.doing = "nothing yet"
-        #: Numbers that the broker did not want once, so that others were sent first.
-        self.put_off: set[int] = set()
+        #: Whether the broker did not want a message once, so that others were sent first.
+        self.has_put_off = False
         self.over = threading.Event()
         self.fleet: FakeFleet
         self.device: ApplianceDevice
@@ -153,7 +152,7 @@ class HostileFleet:
 
     async def _tried(self, source: Source) -> dict[str, Any]:
         await until(lambda: len(self.fleet.published) > FIRST, "messages with a good broker")
-        await self._misbehave(source)
+        await self._misbehave()
         source.stopping = True
         self._be_good()
         return await self._drained(source)
@@ -172,7 +171,7 @@ class HostileFleet:
 
     # What it does
 
-    async def _misbehave(self, source: Source) -> None:
+    async def _misbehave(self) -> None:
         report, dice = self.report, self.random
         began = told = time.monotonic()
         ways = (self._misdeed, self._misdeed, self._garbled, self._limited, self._strange)
@@ -185,23 +184,11 @@ class HostileFleet:
             report.problems += [f"{each}: {self.doing}" for each in self._faults()]
             most = self.fleet.limits.get(Property.MAXIMUM_PACKET_SIZE, LARGEST)
             if most < LARGEST:  # type: ignore[operator]
-                await self._take_larger(source)
+                self.has_put_off = True  # it comes on the next connection, beside what is newer
             if now - told > 60:
                 told = now
                 self.say(str(report))
         report.seconds = time.monotonic() - began
-
-    async def _take_larger(self, source: Source) -> None:
-        """What was too large comes on the next connection, beside what is newer."""
-        self._be_good()
-
-        def is_back() -> bool:
-            """It has subscribed: it knows that there is no limit any more."""
-            found = [each for each in self.fleet.visits if each.ready.is_set()]
-            return any(each.connect and each.connect.client_id == ROBOT for each in found)
-
-        await until(is_back, "the link comes again")
-        self.put_off |= set(range(1, source.sent + 1)) - set(self._received())
 
     def _be_good(self) -> None:
         """The next connection finds a good broker; those of now are reset."""
@@ -291,8 +278,7 @@ class HostileFleet:
 
     def _put_off(self, visit: Visit, packet: Publish) -> None:
         """The link tries it again later, behind what follows."""
-        if packet.topic == EVENTS:
-            self.put_off.add(int(packet.payload.split()[0]))
+        self.has_put_off = True
         refuse(0x97)(visit, packet)
 
     # What has come of it
@@ -329,7 +315,7 @@ class HostileFleet:
         report.set_aside = status["set_aside"]
         if len(source.acknowledged - set(numbers)) > report.set_aside:
             report.problems += account.loss(EVENTS, source.acknowledged, numbers)
-        if not self.put_off:  # else what was put off, and what waited with it, comes behind others
+        if not self.has_put_off:  # else what was put off comes behind others
             report.problems += account.order(EVENTS, numbers, report.connections)
         report.problems += account.inventions(EVENTS, source.sent, numbers)
         report.problems += account.growth(report.memory, GROWTH)
