@@ -75,8 +75,17 @@ assert.equal(shelf.topics.size, 1000)
 for (let index = 0; index < 20; index++) client.send(`a/large${index}`, `"${'x'.repeat(1 << 20)}"`)
 assert.ok(shelf.bytes <= 8 << 20)
 assert.equal(shelf.bytes, [...shelf.topics.values()].reduce((sum, { payload }) => sum + payload.length, 0))
-shelf.look({ run: 2, wanted: [] })
-assert.deepEqual([client.subscribed, shelf.topics.size, (await shelf.told()).run], [[], 0, 2])
+
+// What comes in a later run while an earlier one is told is told in the later one, all of it.
+shelf.look({ run: 2, wanted: [['a/+', 10]] })
+for (const topic of ['a/1', 'a/2', 'a/3']) client.send(topic, '1')
+const earlier = shelf.told()
+shelf.look({ run: 3, wanted: [['a/+', 10]] })
+for (const topic of ['a/1', 'a/2', 'a/3']) client.send(topic, '2')
+assert.deepEqual([(await earlier).run, Object.keys(await told()).length], [2, 3])
+
+shelf.look({ run: 4, wanted: [] })
+assert.deepEqual([client.subscribed, shelf.topics.size, (await shelf.told()).run], [[], 0, 4])
 shelf.stop()
 
 assert.ok(covers('a/#', 'a/b/c') && covers('a/+', 'a/') && covers('a', 'a'))

@@ -68,6 +68,9 @@ class Visit:
         assert told == [], name
 
     def close(self) -> None:
+        """Leave. What the page showed last is told by pytest, where the test failed."""
+        if not self.page.is_closed():
+            print(self.page.url, self.page.inner_text("body"), sep="\n")
         self._context.close()
 
 

@@ -90,12 +90,13 @@ export class Shelf {
 
   /** What has changed: [topic, {text, size, rate, at} or null for what is gone]. */
   async told() {
-    const { run, refused } = this
+    // Of this run to the end: another may begin while a text is made, and has its own.
+    const { run, refused, changed, topics } = this
     const changes = []
-    for (const topic of this.changed) {
+    for (const topic of changed) {
       if (changes.length >= CHANGES) break
-      this.changed.delete(topic)
-      const entry = this.topics.get(topic)
+      changed.delete(topic)
+      const entry = topics.get(topic)
       if (!entry?.size) changes.push([topic, null])
       else changes.push([topic, { ...await words(entry), size: entry.size, rate: entry.rate, at: entry.at }])
     }
