@@ -70,7 +70,7 @@ class Links:
     def _find_left_behind(self) -> None:
         """Only the start and the end of a link change it: what it takes time to find is kept."""
         running = {uplink.settings.name for uplink in self.running}
-        self.left_behind = [name for name in self._backlogs.links() if name not in running]
+        self.left_behind = [name for name in self._backlogs.waiting_links() if name not in running]
 
     def _start_contained(self, link: UpstreamSettings, before: Uplink | None = None) -> None:
         """A fault of one link keeps no other one from its start."""

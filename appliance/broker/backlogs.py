@@ -158,8 +158,8 @@ class Backlogs(Protocol):
     def aside(self, link: str) -> LatestRecords:
         """The records that the link has set aside; the same object each time."""
 
-    def links(self) -> list[str]:
-        """The names of the links of which something is stored, sorted."""
+    def waiting_links(self) -> list[str]:
+        """The names of the links of which messages wait to be sent, sorted."""
 
     def forget(self, link: str) -> None:
         """Remove everything of a link; none of its records may be in use."""

@@ -16,8 +16,8 @@ from appliance.mqtt.codec import (
     V311,
     PacketType,
     Property,
+    decode_binary,
     decode_packet_id,
-    decode_string,
     find_topic_alias,
 )
 from appliance.mqtt.framing import (
@@ -98,6 +98,36 @@ _PUBACKS = {b"\x40\x02": b"", b"\x40\x03": b"\x10", b"\x40\x04": b"\x10\x00"}
 _SHORT = 6
 
 
+#: Properties beside User Properties that a PUBLISH may have, at the least.
+MOST_OTHERS = 16
+
+
+def read_topic(wire: bytes, version: int) -> tuple[str, str]:
+    """The topic of a received message from its bytes with their length, and what is wrong with it;
+    that is empty where nothing is.
+
+    What is wrong is not the server's fault, which may pass on what it was sent.
+
+    Raises:
+        ProtocolError: there is no topic, or it is not UTF-8 and 3.1.1 is spoken.
+    """
+    raw, _ = decode_binary(wire, 0)
+    if not raw:
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, "a topic must not be empty")
+    try:
+        topic = raw.decode()
+    except UnicodeDecodeError:
+        flaw = "a topic must be UTF-8"
+        if version != V5:  # [MQTT-1.5.3-1]
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, flaw) from None
+        return raw.decode(errors="replace"), flaw
+    try:
+        check_topic(topic)
+    except ValueError as error:
+        return topic, str(error)
+    return topic, ""
+
+
 class ClientProtocol(PacketFramer):
     """The client side of one MQTT connection, without I/O, after `connect` was sent.
 
@@ -125,6 +155,8 @@ class ClientProtocol(PacketFramer):
         self._method = announced.get(Property.AUTHENTICATION_METHOD)
         #: Whether the client has sent AUTH with Re-authenticate, and has no answer to it yet.
         self.reauthenticating = False
+        #: By topic alias, what is wrong with the topic that it stands for.
+        self._flaws: dict[int, str] = {}
 
     def take_pubacks(self, data: bytes) -> tuple[Sequence[int], int, bytes]:
         """The packet ids of the PUBACKs of one form that come first, their reason code, and the
@@ -219,23 +251,43 @@ class ClientProtocol(PacketFramer):
 
     def _unusable(self, first: int, body: bytes, flaw: str) -> UnusablePublish:
         """A message with a ContentError: an end would let its publisher cut off who reads it."""
-        size = len(body)
-        self.cost = cost_of(size, size)
-        topic, pos = decode_string(body, 0)
+        wire, pos = decode_binary(body, 0)
         packet_id = None
         if first & 6:
             packet_id, pos = decode_packet_id(PacketType.PUBLISH, body, pos)
-        alias = find_topic_alias(body, pos, size)
-        if topic or alias is None:
-            try:
-                check_topic(topic)
-            except ValueError as error:
-                raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+        alias = self._alias_of(body, pos) if self.version == V5 else None
+        if not wire and alias is None:
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, "a topic must not be empty")
+        topic, topic_flaw = read_topic(body[: 2 + len(wire)], self.version) if wire else ("", "")
         if alias is not None:
-            topic = self._resolve(alias, topic)
+            topic = super()._resolve(alias, topic)
+            if topic_flaw:
+                self._flaws[alias] = topic_flaw
         return UnusablePublish(
             topic, b"", first >> 1 & 3, bool(first & 1), first >= 0x38, packet_id, flaw=flaw
         )
+
+    def _alias_of(self, body: bytes, pos: int) -> int | None:
+        """The topic alias of a message that is not decoded; None where it has none."""
+        most = self.user_properties + MOST_OTHERS
+        self.cost = cost_of(most, len(body))
+        try:
+            return find_topic_alias(body, pos, len(body), most)
+        except ContentError:
+            # It may be given a topic behind all these. Messages that use one it had before must not
+            # be taken for those of that topic: they end the connection.
+            self._aliases.clear()
+            self._flaws.clear()
+            self._aliased = 0
+            return None
+
+    def _resolve(self, alias: int, topic: str) -> str:
+        found = super()._resolve(alias, topic)
+        if topic:
+            self._flaws.pop(alias, None)
+        elif alias in self._flaws:
+            raise ContentError(ReasonCode.MALFORMED_PACKET, self._flaws[alias])
+        return found
 
     def _on_connack(self, connack: Connack) -> None:
         if connack.reason_code:

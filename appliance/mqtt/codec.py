@@ -196,6 +196,9 @@ PROPERTY_RULES: Final[dict[Property, PropertyRule]] = {
 _KNOWN: Final = {int(identifier): (identifier, rule) for identifier, rule in PROPERTY_RULES.items()}
 
 
+_WITH_NUL: Final = "a string holds U+0000"
+
+
 def malformed(message: str) -> ProtocolError:
     """The error for bytes that cannot be parsed (5.0 section 4.13)."""
     return ProtocolError(ReasonCode.MALFORMED_PACKET, message)
@@ -311,9 +314,9 @@ def decode_string(buf: bytes, pos: int) -> tuple[str, int]:
         # Strict about surrogates and overlong forms: [MQTT-1.5.3-1] v5 [MQTT-1.5.4-1].
         value = raw.decode()
     except UnicodeDecodeError as error:
-        raise malformed("a string is not UTF-8") from error
+        raise ContentError(ReasonCode.MALFORMED_PACKET, "a string is not UTF-8") from error
     if "\0" in value:  # [MQTT-1.5.3-2] v5 [MQTT-1.5.4-2]
-        raise malformed("a string holds U+0000")
+        raise ContentError(ReasonCode.MALFORMED_PACKET, _WITH_NUL)
     return value, pos
 
 
@@ -449,14 +452,19 @@ def read_properties(
     return (checked.values or None) if checked is not None else None, pos
 
 
-def find_topic_alias(buf: bytes, pos: int, end: int) -> int | None:
+def find_topic_alias(buf: bytes, pos: int, end: int, most: int) -> int | None:
     """The Topic Alias among the properties at `pos` of a PUBLISH that ends at `end`.
 
     Nothing is checked but where each property ends: for those in which there is a ContentError.
+    Raises one if the alias is not among the first `most` properties, and there are more.
     """
     stop, pos = _property_section(buf, pos, end)
     buf = buf[:stop]  # so that a truncated value is not completed by later bytes
+    count = 0
     while pos < stop:
+        count += 1
+        if count > most:
+            raise _too_many_pairs(most)
         known = _KNOWN.get(buf[pos])
         if known is None:
             raise malformed(f"unknown property 0x{buf[pos]:02x}")
@@ -528,7 +536,7 @@ def _check_string(buf: bytes, pos: int, stop: int) -> int:
         if end > stop:
             raise malformed("the packet ends inside a string or binary data")
         if buf.find(0, start, end) >= 0:  # [MQTT-1.5.3-2] v5 [MQTT-1.5.4-2]
-            raise malformed("a string holds U+0000")
+            raise ContentError(ReasonCode.MALFORMED_PACKET, _WITH_NUL)
         if not buf[start:end].isascii():
             decode_string(buf, pos)
     return end
@@ -561,7 +569,10 @@ def _decode_property(
     else:
         number, pos = decode_varint(buf, pos)
     if number < rule.minimum or number > rule.maximum:
-        raise ProtocolError(rule.out_of_range, f"{identifier.name} must not be {number}")
+        text = f"{identifier.name} must not be {number}"
+        if identifier is Property.PAYLOAD_FORMAT_INDICATOR:
+            raise ContentError(rule.out_of_range, text)
+        raise ProtocolError(rule.out_of_range, text)
     if kind is Kind.VARINT:
         cast("list[int]", properties.setdefault(identifier, [])).append(number)
     else:

@@ -21,7 +21,7 @@ from typing import TypeAlias
 
 from appliance.mqtt.codec import PacketType, Property, decode_varint, text_size
 from appliance.mqtt.packets import Packet, Publish, decode_packet
-from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.reason import ContentError, ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
 #: header byte, topic with its two length bytes, packet id (0 for QoS 0), payload,
@@ -346,7 +346,7 @@ class PacketFramer:
         try:
             check_topic(packet.topic)  # [MQTT-3.3.2-2], [MQTT-4.7.3-1]
         except ValueError as error:
-            raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from None
+            raise ContentError(ReasonCode.MALFORMED_PACKET, str(error)) from None
         return packet
 
     def _resolve(self, alias: int, topic: str) -> str:

@@ -72,7 +72,8 @@ class ProtocolError(Exception):
 
 
 class ContentError(ProtocolError):
-    """What a publisher has put into a message is wrong, where the packet itself is in order.
+    """What a publisher has put into a message is wrong, where the packet itself is in order: its
+    topic, or a property with which it was published.
 
     A server may have passed it on as it was: whose fault it is, only the publisher's server knows.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from appliance.broker.backlogs import Journal, LatestRecords, SingleRecords
+from appliance.broker.backlogs import NO_MESSAGE, Journal, LatestRecords, SingleRecords
 from appliance.store.rows import LATEST, SET_ASIDE
 
 AnyJournal = TypeVar("AnyJournal", bound=Journal)
@@ -59,10 +59,18 @@ class LinkBacklogs(Generic[AnyJournal, AnyRecords, AnySingle]):
         """See `Backlogs`."""
         return self.records(link, SET_ASIDE)
 
-    def links(self) -> list[str]:
+    def waiting_links(self) -> list[str]:
         """See `Backlogs`."""
-        names = {link for (link, _), journal in self._journals.items() if journal.segments()}
-        names |= {link for (link, _), records in self._records.items() if records.load()}
+        names = {
+            link
+            for (link, _), journal in self._journals.items()
+            if any(segment.done < segment.count for segment in journal.segments())
+        }
+        names |= {
+            link
+            for (link, kind), records in self._records.items()
+            if kind == LATEST and any(row[:1] != NO_MESSAGE for _, row in records.load())
+        }
         names |= {link for link, records in self._single.items() if records.load()}
         return sorted(names)
 

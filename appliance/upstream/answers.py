@@ -188,12 +188,15 @@ class Answers:
         if self._own.match(topic):
             return True
         # A rule may have a prefix of its own for calls.
-        above, _, token = topic.rpartition("/")
-        if not above.endswith("/_reply"):
+        above, found, token = topic.partition("/_reply/")
+        if not found:
             return False
-        called = (above[: -len("_reply")] + last for last in (*_CALLS, "_set", "set"))
+        called = (f"{above}/{last}" for last in (*_CALLS, "_set", "set"))
+        last = token.rpartition("/")[2]  # with MQTT 5 there may be more levels before it
         return any(
-            self._own.match(each) or self._own.match(f"{each}/{token}")
+            self._own.match(each)
+            or self._own.match(f"{each}/{token}")
+            or self._own.match(f"{each}/{last}")
             for each in called
             if _is_call(each)
         )

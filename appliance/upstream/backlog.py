@@ -373,7 +373,7 @@ class Backlog:
         while True:
             replaced = None if latest is None else queue.latest.get(latest)
             added = size if replaced is None else size - replaced.size
-            if self._tally.bytes + added <= room:
+            if added <= 0 or self._tally.bytes + added <= room:
                 return True
             if not self._eviction.make_room(queue.lane, added, now, room):
                 return False

@@ -295,17 +295,13 @@ class InSession:
     def _publish(self, came: _Came) -> bool:
         """Publish it, or drop or refuse it; False if it has to wait."""
         packet = came.packet
-        if came.is_refused:
-            reason = "too much waits for its receivers here"
-            self._refuse(packet, ReasonCode.QUOTA_EXCEEDED, reason)
-            return True
-        if packet.flaw:
-            self._refuse(packet, ReasonCode.UNSPECIFIED_ERROR, packet.flaw)
-            return True
         # It is split and checked again at each step, and an alias of two bytes may stand for it.
         self._broker.counters.cost += len(packet.topic) >> TOPIC_SHIFT
         if packet.topic.count("/") >= self._broker.limits.topic_levels + self._prefixed:
             self._refuse(packet, ReasonCode.TOPIC_NAME_INVALID, "its topic has too many levels")
+            return True
+        if came.is_refused or packet.flaw:
+            self._refuse_unread(came)
             return True
         answers_there = self._settings.answers_there
         if packet.topic.startswith(answers_there) or "/_reply/" in packet.topic:
@@ -342,6 +338,20 @@ class InSession:
         if self._counters.refused > refused:
             self._counters.dropped[rule.remote_filter, Verdict.REFUSED] += 1
         return is_dealt_with
+
+    def _refuse_unread(self, came: _Came) -> None:
+        """Refuse what has no room or is flawed, whatever rule carries it."""
+        packet = came.packet
+        found = self._rules.inward(packet.topic)
+        if found is not None:
+            name = found[0].remote_filter
+            self._counters.came[name] += 1
+            self._counters.dropped[name, Verdict.REFUSED] += 1
+        if came.is_refused:
+            reason = "too much waits for its receivers here"
+            self._refuse(packet, ReasonCode.QUOTA_EXCEEDED, reason)
+        else:
+            self._refuse(packet, ReasonCode.UNSPECIFIED_ERROR, packet.flaw)
 
     def _is_dropped(self, came: _Came, rule: InRule, topic: str) -> bool:
         packet = came.packet

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar, cast
 
-from appliance.mqtt.client_protocol import ClientProtocol
+from appliance.mqtt.client_protocol import ClientProtocol, read_topic
 from appliance.mqtt.codec import (
     MAX_LENGTH,
     MAX_VARINT,
@@ -26,10 +26,8 @@ from appliance.mqtt.codec import (
     V311,
     Properties,
     Property,
-    decode_string,
     encode_string,
     encode_varint,
-    malformed,
     quote,
 )
 from appliance.mqtt.framing import PUBACK, PUBREC, PUBREL, RawPublish
@@ -53,7 +51,7 @@ from appliance.mqtt.packets import (
     UnusablePublish,
 )
 from appliance.mqtt.reason import ProtocolError, ReasonCode
-from appliance.mqtt.topics import check_topic, parse_shared
+from appliance.mqtt.topics import parse_shared
 from appliance.upstream.agreement import (
     LONGEST_REASON,
     ConnectSettings,
@@ -644,15 +642,12 @@ class FleetConnection(Generic[T]):
     def _on_raw_publish(self, publish: RawPublish) -> Arrived | None:
         first, topic_wire, packet_id, payload, _ = publish
         topic = self._heard.get(topic_wire)
+        flaw = ""
         if topic is None:
-            topic, _ = decode_string(topic_wire, 0)
-            try:
-                check_topic(topic)
-            except ValueError as error:
-                raise malformed(str(error)) from None
+            topic, flaw = read_topic(topic_wire, self._version)
             if len(self._heard) >= CACHED:
                 self._heard.clear()
-            if len(topic_wire) <= LONGEST_CACHED:
+            if len(topic_wire) <= LONGEST_CACHED and not flaw:
                 self._heard[topic_wire] = topic
         qos = first >> 1 & 3
         dup = first >= 0x38
@@ -669,6 +664,7 @@ class FleetConnection(Generic[T]):
             None,
             NO_PROPERTIES,
             not_before,
+            flaw,
         )
 
     def _on_publish(self, packet: Publish) -> Arrived | None:

@@ -23,6 +23,10 @@ VIA: Final = "appliance-via"
 #: The most robots that a message passes: more are a circle in which nobody knows its own name.
 MOST_ROBOTS: Final = 8
 
+#: User properties that a message gets on its way, at most: of each link the robot, `id` and
+#: `published-at`.
+MOST_ADDED: Final = 3 * (MOST_ROBOTS + 1)
+
 _PAIR: Final = bytes((Property.USER_PROPERTY,)) + encode_string(VIA)
 
 

@@ -22,11 +22,20 @@ from appliance.broker.link import InsideLink, ReceivingLink
 from appliance.broker.message import Message
 from appliance.broker.session import Session, publisher_of
 from appliance.broker.values import Action, Identity, PublishRejection
-from appliance.mqtt.codec import V5, Properties, Property, encode_properties, encode_string
+from appliance.mqtt.codec import (
+    MAXIMUM_PAIRS,
+    V5,
+    Properties,
+    Property,
+    encode_properties,
+    encode_string,
+)
+from appliance.mqtt.framing import cost_of
 from appliance.mqtt.packets import Subscription
 from appliance.mqtt.reason import ProtocolError, ReasonCode
 from appliance.upstream.answers import Answers
 from appliance.upstream.loops import with_via
+from appliance.upstream.publish_properties import LARGEST_KEPT, printable
 from appliance.upstream.rules import LinkRules, OutRule, UpstreamSettings
 from appliance.upstream.sessions import (
     answers_client_id,
@@ -138,6 +147,8 @@ class OutSession:
         self._answering: Session | None = None
         #: Whether filters that are not subscribed to are asked about in the next turn.
         self._must_ask = False
+        #: The properties that were looked at last, and what of them is sent.
+        self._looked_at = self._found = b""
         #: The work of the backlog that is counted as the broker's.
         self._counted = backlog.work
 
@@ -342,7 +353,19 @@ class OutSession:
                 publisher = publisher_of(message)
                 topic, properties = self._request(topic, wanted, publisher, properties)
                 wire = encode_properties(properties)
-        return topic, with_via(wire, self._settings.robot)
+        return topic, with_via(self._printable(wire), self._settings.robot)
+
+    def _printable(self, wire: bytes) -> bytes:
+        """`printable`; most messages have none, or the same as the one before."""
+        if len(wire) == 1:
+            return wire
+        if wire == self._looked_at:
+            return self._found
+        self._broker.counters.cost += cost_of(MAXIMUM_PAIRS, len(wire))
+        found = printable(wire)
+        if len(wire) <= LARGEST_KEPT:
+            self._looked_at, self._found = wire, found
+        return found
 
     def _request(
         self, topic: str, wanted: str, publisher: Session | None, properties: Properties

@@ -10,7 +10,6 @@ from math import floor, inf
 from typing import Final, cast
 
 from appliance.mqtt.codec import (
-    NO_PROPERTIES,
     PacketType,
     Properties,
     Property,
@@ -36,8 +35,31 @@ _PUBLISHED: Final = (
     + encode_string("2000-01-01T00:00:00.000+00:00")[:2]
 )
 
+#: Bytes of properties, at most, that are kept for the next message.
+LARGEST_KEPT: Final = 4096
+
 #: Seconds by which a time is away from those of another millisecond: more than what is rounded.
 _ROUNDED: Final = 2e-6
+
+
+def printable(published: bytes) -> bytes:
+    """The encoded properties, with their length in front, without those that hold control
+    characters.
+
+    A receiver may close the connection upon them (5.0 section 1.5.4), and mosquitto does, while our
+    clients are let use them.
+    """
+    values, _ = decode_properties(published, 0, len(published), PacketType.PUBLISH)
+    kept: Properties = {}
+    for name, value in (values or {}).items():
+        if name is Property.USER_PROPERTY:
+            pairs = cast("list[tuple[str, str]]", value)
+            pairs = [each for each in pairs if not any(map(holds_control, each))]
+            if pairs:
+                kept[name] = pairs
+        elif not (isinstance(value, str) and holds_control(value)):
+            kept[name] = value
+    return published if kept == (values or {}) else encode_properties(kept)
 
 
 class PublishProperties:
@@ -50,32 +72,6 @@ class PublishProperties:
         #: from when until when they are the same.
         self._dated = self._published_with = b""
         self._since = self._until = inf
-        #: The last ones that were looked at, and what of them is sent.
-        self._looked_at = self._printable = NO_PROPERTIES
-
-    def printable(self, published: bytes) -> bytes:
-        """The properties without those that hold control characters.
-
-        A receiver may close the connection upon them (5.0 section 1.5.4), and mosquitto does, while
-        our clients are let use them.
-        """
-        if len(published) == 1:  # there are none
-            return published
-        if published == self._looked_at:
-            return self._printable
-        values, _ = decode_properties(published, 0, len(published), PacketType.PUBLISH)
-        kept: Properties = {}
-        for name, value in (values or {}).items():
-            if name is Property.USER_PROPERTY:
-                pairs = cast("list[tuple[str, str]]", value)
-                pairs = [each for each in pairs if not any(map(holds_control, each))]
-                if pairs:
-                    kept[name] = pairs
-            elif not (isinstance(value, str) and holds_control(value)):
-                kept[name] = value
-        self._looked_at = published
-        self._printable = published if kept == (values or {}) else encode_properties(kept)
-        return self._printable
 
     def encode(
         self, published: bytes, expiry: int | None, number: int | None, published_at: float | None
@@ -86,7 +82,8 @@ class PublishProperties:
         expiry. `expiry` is the Message Expiry Interval, `number` is told as `id`, and
         `published_at` is a time of the wall clock in seconds.
         """
-        if expiry is None and number is None and published_at is not None:
+        is_plain = expiry is None and number is None and len(published) <= LARGEST_KEPT
+        if published_at is not None and is_plain:
             return self._encode_dated(published, published_at)
         inside = _without_length(published)
         if expiry is not None:

@@ -194,7 +194,7 @@ class Sender:
             return
         properties = NO_PROPERTIES
         if is_v5:
-            properties = self._properties.printable(record.properties_wire)
+            properties = record.properties_wire
             at, number = entry.published_at, record.number if record.qos == 2 else None
             if at is not None:
                 at = None if offset is None else at + offset

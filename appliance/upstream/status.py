@@ -59,6 +59,11 @@ class LinkStatus:
     state_refusal: str | None = None
     advice: str | None = None
 
+    def count_dropped(self, rule: str, reason: str, count: int) -> None:
+        """So many messages of a rule were dropped; one in the other direction may have its name."""
+        reasons = self.dropped.setdefault(rule, {})
+        reasons[reason] = reasons.get(reason, 0) + count
+
     def as_json(self) -> dict[str, Any]:
         """All of it as JSON values."""
         return asdict(self)

@@ -21,7 +21,7 @@ from appliance.broker.backlogs import Backlogs
 from appliance.broker.broker import Broker
 from appliance.broker.message import Message
 from appliance.broker.meter import Meter
-from appliance.mqtt.codec import V5, Properties, Property, quote
+from appliance.mqtt.codec import MAXIMUM_PAIRS, V5, Properties, Property, quote
 from appliance.mqtt.packets import Subscription, Will
 from appliance.mqtt.reason import ReasonCode
 from appliance.net.callbacks import Entries, PeriodicCallback
@@ -34,6 +34,7 @@ from appliance.upstream.credentials import Credentials
 from appliance.upstream.in_session import InCounters, InSession
 from appliance.upstream.limits import KINDS
 from appliance.upstream.line import AGAIN, Line
+from appliance.upstream.loops import MOST_ADDED
 from appliance.upstream.out_session import OutSession
 from appliance.upstream.presence import Presence
 from appliance.upstream.readiness import Readiness
@@ -365,7 +366,7 @@ class Uplink:
             window=min(settings.window, limits.window),
             receive_maximum=RECEIVE_MAXIMUM,
             maximum_packet_size=self.broker.limits.packet_size,
-            user_properties=self.broker.limits.user_properties,
+            user_properties=min(MAXIMUM_PAIRS, self.broker.limits.user_properties + MOST_ADDED),
             filters_per_packet=limits.filters or 100,
         )
 
@@ -446,9 +447,9 @@ class Uplink:
             status.unacknowledged += channel.connection.unacknowledged
             status.held_back += channel.inward.waiting if channel.inward is not None else 0
         for (rule, reason), count in counts.dropped.items():
-            status.dropped.setdefault(rule.lstrip("\0"), {})[reason.value] = count
+            status.count_dropped(rule.lstrip("\0"), reason.value, count)
         for (rule, verdict), count in self._in_counters.dropped.items():
-            status.dropped.setdefault(rule, {})[verdict.value] = count
+            status.count_dropped(rule, verdict.value, count)
         status.set_aside, status.too_large = counts.aside, counts.held
         status.refused_filters = [each for line in self._lines for each in line.refused_filters]
         status.missing_filters = [each for line in self._lines for each in line.missing_filters]

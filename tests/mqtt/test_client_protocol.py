@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from unittest.mock import ANY
 
 import pytest
 from examples import examples
@@ -27,6 +28,7 @@ from appliance.mqtt.codec import (
     Properties,
     Property,
     encode_properties,
+    encode_property_list,
     encode_varint,
     find_topic_alias,
 )
@@ -52,7 +54,7 @@ from appliance.mqtt.packets import (
     UnusablePublish,
     decode_packet,
 )
-from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.reason import ContentError, ProtocolError, ReasonCode
 
 SIZE = 100_000
 ALIASES = 10
@@ -115,23 +117,54 @@ def said_slowly(data: bytes, version: int) -> list[Packet | ReasonCode]:
                     raise ProtocolError(ReasonCode.PACKET_TOO_LARGE, "too large")
             if len(data) < size:
                 break
-            packet = without_pairs(decode_packet(data[0], data[size - length : size], version))
-            if isinstance(packet, Publish):
-                # A server may send these; what else `resolve` checks holds for both sides.
-                numbers = (packet.properties or {}).pop(Property.SUBSCRIPTION_IDENTIFIER, None)
-                resolve(packet, aliases)
-                if numbers is not None:
-                    packet.properties = {
-                        **(packet.properties or {}),
-                        Property.SUBSCRIPTION_IDENTIFIER: numbers,
-                    }
+            body = data[size - length : size]
+            try:
+                packet = without_pairs(decode_packet(data[0], body, version))
+                if isinstance(packet, Publish):
+                    # A server may send these; what else `resolve` checks holds for both sides.
+                    numbers = (packet.properties or {}).pop(Property.SUBSCRIPTION_IDENTIFIER, None)
+                    resolve(packet, aliases)
+                    if numbers is not None:
+                        packet.properties = {
+                            **(packet.properties or {}),
+                            Property.SUBSCRIPTION_IDENTIFIER: numbers,
+                        }
+            except ContentError:
+                if data[0] >> 4 != 3:
+                    raise
+                packet = unusable(data[0], body, version, aliases)
             found.append(packet)
             if isinstance(packet, Disconnect):
                 break
             data = data[size:]
+    except UnicodeDecodeError:  # of 3.1.1 [MQTT-1.5.3-1]
+        found.append(ReasonCode.MALFORMED_PACKET)
     except ProtocolError as error:
         found.append(error.code)
     return found
+
+
+def unusable(first: int, body: bytes, version: int, aliases: dict[int, str]) -> UnusablePublish:
+    """A message that its publisher has made so, where the packet is in order beside that."""
+    end = 2 + int.from_bytes(body[:2], "big")
+    topic = body[2:end].decode(errors="strict" if version == 4 else "replace")
+    packet_id = None
+    if first & 6:
+        packet_id = int.from_bytes(body[end : end + 2], "big")
+        end += 2
+        if not packet_id or end > len(body):
+            raise ProtocolError(ReasonCode.MALFORMED_PACKET, "no packet id")
+    alias = find_topic_alias(body, end, len(body), 1 << 20) if version == 5 else None
+    if alias is not None and not 0 < alias <= ALIASES:
+        raise ProtocolError(ReasonCode.TOPIC_ALIAS_INVALID, "too many")
+    if alias is None and not topic:
+        raise ProtocolError(ReasonCode.MALFORMED_PACKET, "no topic")
+    if alias is not None:
+        if not topic and alias not in aliases:
+            raise ProtocolError(ReasonCode.PROTOCOL_ERROR, "never said")
+        topic = aliases[alias] = topic or aliases[alias]
+    qos = first >> 1 & 3
+    return UnusablePublish(topic, b"", qos, bool(first & 1), first >= 0x38, packet_id, flaw=ANY)
 
 
 @st.composite
@@ -547,6 +580,7 @@ FLAWS: list[tuple[Properties, str]] = [
     ),
     ({Property.RESPONSE_TOPIC: "a/#"}, "response topic: "),
     ({Property.RESPONSE_TOPIC: ""}, "response topic: "),
+    ({Property.PAYLOAD_FORMAT_INDICATOR: 2}, "PAYLOAD_FORMAT_INDICATOR must not be 2"),
 ]
 
 
@@ -586,15 +620,40 @@ def test_a_packet_that_is_wrong_as_well_ends_it(more: bytes) -> None:
     assert isinstance(code, ReasonCode)
 
 
+@pytest.mark.parametrize("properties", [{}, {Property.RESPONSE_TOPIC: "#"}])
 @pytest.mark.parametrize("topic", ["a/+", "\x85"])
-def test_a_topic_that_is_wrong_as_well_ends_it(topic: str) -> None:
-    wrong: Properties = {Property.RESPONSE_TOPIC: "#", Property.TOPIC_ALIAS: 3}
-    (code,) = said(connected(), [Publish(topic, b"", properties=wrong).encode(5)])
-    assert code == ReasonCode.MALFORMED_PACKET
+def test_a_wrong_topic_is_wrong_under_its_alias_too(topic: str, properties: Properties) -> None:
+    client = connected()
+    alias: Properties = {Property.TOPIC_ALIAS: 3}
+    wires = [
+        Publish(topic, b"", properties={**alias, **properties}).encode(5),
+        Publish("", b"", properties=alias).encode(5),
+        Publish("good", b"", properties=alias).encode(5),
+        Publish("", b"", properties=alias).encode(5),
+    ]
+    events = [event for wire in wires for event in said(client, [wire])]
+    assert [isinstance(event, UnusablePublish) for event in events] == [True, True, False, False]
+    assert [event.topic for event in events] == [topic, topic, "good", "good"]
 
 
 @given(publishes(5))
 def test_the_alias_is_found(packet: Publish) -> None:
     data = encode_properties(packet.properties)
     alias = (packet.properties or {}).get(Property.TOPIC_ALIAS)
-    assert find_topic_alias(data, 0, len(data)) == alias
+    assert find_topic_alias(data, 0, len(data), 1 << 20) == alias
+
+
+def test_no_alias_is_looked_for_behind_millions_of_properties() -> None:
+    """A stranger's message of 16 MiB costs no more than one of a thousand properties."""
+    alias: Properties = {Property.TOPIC_ALIAS: 3}
+    client = connected(size=1 << 25)
+    assert len(said(client, [Publish("t", b"", properties=alias).encode(5)])) == 1
+    for tail in (b"", encode_property_list(alias)):
+        properties = b"\x26\0\0\0\0" * (1 << 20) + tail
+        body = b"\0\1t" + encode_varint(len(properties)) + properties
+        wire = b"\x30" + encode_varint(len(body)) + body
+        (event,) = said(client, [wire])
+        assert isinstance(event, UnusablePublish) and event.topic == "t"
+    # It may have got another topic there.
+    (code,) = said(client, [Publish("", b"", properties=alias).encode(5)])
+    assert code == ReasonCode.PROTOCOL_ERROR

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_properties import binaries, connects, packets, publishes, topics
 
-from appliance.mqtt.client_protocol import ClientProtocol
+from appliance.mqtt.client_protocol import ClientProtocol, read_topic
 from appliance.mqtt.codec import Property, decode_properties, decode_string, encode_varint
 from appliance.mqtt.connection import ServerProtocol
 from appliance.mqtt.framing import MAXIMUM_CONNECT, MAXIMUM_CONTROL, Event, State
@@ -35,9 +35,10 @@ from appliance.mqtt.packets import (
     Subscription,
     Unsuback,
     Unsubscribe,
+    UnusablePublish,
     decode_packet,
 )
-from appliance.mqtt.reason import ProtocolError, ReasonCode
+from appliance.mqtt.reason import ContentError, ProtocolError, ReasonCode
 from appliance.mqtt.topics import check_topic
 
 SIZE = 100_000
@@ -80,6 +81,18 @@ def as_packet(event: Event, version: int) -> Packet:
     return packet
 
 
+def flawed_packet(event: Event, version: int) -> Packet | None:
+    """What a client makes of a topic that cannot be used, which a server does not take."""
+    if not isinstance(event, tuple):
+        return None
+    first, topic_wire, packet_id, _, _ = event
+    topic, flaw = read_topic(topic_wire, version)
+    if not flaw:
+        return None
+    qos, dup = first >> 1 & 3, first >= 0x38
+    return UnusablePublish(topic, b"", qos, bool(first & 1), dup, packet_id or None, flaw=flaw)
+
+
 #: What is of one connection, or is counted down, and so is not passed on.
 OWN = Property.TOPIC_ALIAS, Property.MESSAGE_EXPIRY_INTERVAL, Property.SUBSCRIPTION_IDENTIFIER
 
@@ -118,7 +131,9 @@ def said(
     try:
         for chunk in chunks:
             for event in connection.receive_data(chunk):
-                found.append(as_packet(event, connection.version))
+                is_client = isinstance(connection, ClientProtocol)
+                flawed = flawed_packet(event, connection.version) if is_client else None
+                found.append(flawed or as_packet(event, connection.version))
     except ProtocolError as error:
         found.append(error.code)
         connection.close()  # as its owner does, for a topic that is not valid
@@ -188,7 +203,7 @@ def resolve(packet: Publish, aliases: dict[int, str]) -> None:
     try:
         check_topic(packet.topic)
     except ValueError as error:
-        raise ProtocolError(ReasonCode.MALFORMED_PACKET, str(error)) from error
+        raise ContentError(ReasonCode.MALFORMED_PACKET, str(error)) from error
 
 
 def split_at(data: bytes, cuts: Iterable[int]) -> list[bytes]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +82,23 @@ def test_files_of_the_fleet_that_are_not_there(here: Path) -> None:
         *["the one that the fleet has made for this robot belongs there"] * 2,
     ]
     assert f"error tls.ca: there is no file {here / 'nope.crt'}" in told[0]
+
+
+def test_a_folder_that_may_not_be_looked_into_is_told(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Root, who runs tests, may look into all."""
+
+    stat = Path.stat
+
+    def closed(path: Path, *, follow_symlinks: bool = True) -> os.stat_result:
+        if path.name == "the.key":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat(path, follow_symlinks=follow_symlinks)
+
+    monkeypatch.setattr(Path, "stat", closed)
+    told = troubles(here, tls={"certificate": "no.crt", "key": "the.key"})
+    assert f"error tls.key: {here / 'the.key'} cannot be read: Permission denied" in told[1]
 
 
 def test_backlogs_that_the_disk_has_no_room_for(here: Path) -> None:

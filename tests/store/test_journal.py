@@ -329,14 +329,14 @@ async def test_the_latest_records(harness: Harness, tmp_path: Path) -> None:
     assert backlogs.latest("fleet").load() == [(first, b"three")]
     assert backlogs.aside("fleet").load() == [(aside, b"poison")]
     backlogs.journal("other", 2).append(b"x")
-    assert backlogs.links() == ["fleet", "other"]
+    assert backlogs.waiting_links() == ["fleet", "other"]
     backlogs.forget("fleet")
-    assert backlogs.links() == ["other"]
+    assert backlogs.waiting_links() == ["other"]
     await twin.written()
     assert not keys(twin, "latest")
     backlogs.forget("other")
     await twin.written()
-    assert not keys(twin, "backlog") and not backlogs.links()
+    assert not keys(twin, "backlog") and not backlogs.waiting_links()
     await twin.stop()
 
 
@@ -423,7 +423,7 @@ async def test_records_that_are_read_one_by_one(harness: Harness, tmp_path: Path
     assert again.load() == [*found[2:], later]
     assert await _single(twin, found[3]) == [b"\3" * 1000]
     assert await _single(twin, later) == [b"x" * 1000]
-    assert twin.store.backlogs.links() == ["fleet"]
+    assert twin.store.backlogs.waiting_links() == ["fleet"]
     assert not twin.store.backlogs.journal("fleet", 0).segments()
     twin.store.backlogs.forget("fleet")
     await twin.written()
@@ -477,7 +477,7 @@ async def test_what_waits_is_shown_and_pruned(harness: Harness) -> None:
     with pytest.raises(StoreError, match="nothing waits for an upstream 'fleet'"):
         prune_upstream(harness.path, "fleet")
     harness.start()
-    assert harness.store.backlogs.links() == ["other"]
+    assert harness.store.backlogs.waiting_links() == ["other"]
     assert await unsettled(opened(harness, "other")) == [b"x"]
 
 
@@ -529,7 +529,7 @@ async def test_values_that_are_only_on_disk_are_shown_and_pruned(harness: Harnes
     )
     assert harness.path.stat().st_size < 0.6 * before
     harness.start()
-    assert harness.store.backlogs.links() == ["other"]
+    assert harness.store.backlogs.waiting_links() == ["other"]
     assert not await drained(backlog(harness, "fleet"))
     assert await drained(backlog(harness, "other")) == values
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from broker.conftest import FakeAccess
 from waiting import until
 
-from appliance.broker.backlogs import SEGMENT_SIZE, Backlogs, Segment
+from appliance.broker.backlogs import NO_MESSAGE, SEGMENT_SIZE, Backlogs, Segment
 from appliance.broker.broker import Broker
 from appliance.store import MemoryStore
 from appliance.store.memory_backlogs import MemoryBacklogs
@@ -88,17 +88,17 @@ def test_lanes_and_links_are_apart() -> None:
     backlogs.aside("d").put(None, b"two")
     assert backlogs.latest("c").put(key, b"three") == key
     assert backlogs.latest("c").load() == [(key, b"three")]
-    assert backlogs.links() == ["a", "b", "c", "d"]
+    assert backlogs.waiting_links() == ["a", "b", "c"]  # what is set aside is not sent
     backlogs.forget("a")
     backlogs.forget("d")
-    assert backlogs.links() == ["b", "c"]
+    assert backlogs.waiting_links() == ["b", "c"] and not backlogs.aside("d").load()
     backlogs.latest("c").remove(key)
     backlogs.latest("c").remove(key)
-    assert backlogs.links() == ["b"]
+    assert backlogs.waiting_links() == ["b"]
     assert not backlogs.failing
     single = backlogs.single("e")
     one, two = single.put(b"one"), single.put(b"two")
-    assert single.load() == [one, two] and backlogs.links() == ["b", "e"]
+    assert single.load() == [one, two] and backlogs.waiting_links() == ["b", "e"]
     read: list[object] = []
     single.read(two, read.append)
     single.remove(one)
@@ -107,7 +107,12 @@ def test_lanes_and_links_are_apart() -> None:
         memory.rounds.popleft()()
     assert read == [[b"two"], []]
     backlogs.forget("e")
-    assert backlogs.links() == ["b"]
+    assert backlogs.waiting_links() == ["b"]
+    for lane in (0, 1):
+        journal = backlogs.journal("b", lane)
+        journal.settle(journal.segments()[0], 1)
+    backlogs.latest("b").put(None, NO_MESSAGE + b"{}")
+    assert not backlogs.waiting_links()
 
 
 async def test_a_fault_of_the_reader_is_contained(escaped: list[str]) -> None:

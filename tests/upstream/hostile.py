@@ -392,11 +392,6 @@ def _client_packet(visit: Visit, sent: object) -> None:
         "qos-3": raw_publish(0x06, b"a", b"\0\1\0x"),
         "dup-with-qos-0": raw_publish(0x08, b"a"),
         "id-0": raw_publish(0x02, b"a", b"\0\0\0x"),
-        "topic-not-utf-8": raw_publish(0, b"\xc3\x28"),
-        "topic-with-nul": raw_publish(0, b"a\0b"),
-        "topic-with-surrogate": raw_publish(0, b"\xed\xa0\x80"),
-        "topic-wildcard": raw_publish(0, b"a/#"),
-        "topic-plus": raw_publish(0, b"a/+/b"),
         "topic-empty": raw_publish(0, b""),
         "topic-longer-than-the-packet": packet(0x30, b"\xff\xffabc"),
         "properties-longer-than-the-packet": raw_publish(0, b"a", b"\x7fx"),
@@ -404,7 +399,6 @@ def _client_packet(visit: Visit, sent: object) -> None:
         "alias-never-set": raw_publish(0, b"", b"\x03\x23\x00\x01x"),
         "alias-too-high": raw_publish(0, b"a", b"\x03\x23\xff\xffx"),
         "subscription-identifier-0": raw_publish(0, b"a", b"\x02\x0b\x00x"),
-        "payload-format-2": raw_publish(0, b"a", b"\x02\x01\x02x"),
         "garbage": bytes(range(0x31, 0x100)) * 4,
     },
 )
@@ -421,8 +415,19 @@ def _bytes(visit: Visit, sent: object) -> None:
         "response-topic-wildcard": raw_publish(0, b"a", b"\x06\x08\x00\x03a/#x"),
         "response-topic-empty": raw_publish(2, b"a", b"\0\7\x03\x08\x00\x00x"),
         "many-user-properties": Publish(
-            "a", b"x", 1, packet_id=7, properties={Property.USER_PROPERTY: [("a", "b")] * 1001}
+            "a", b"x", 1, packet_id=7, properties={Property.USER_PROPERTY: [("a", "b")] * 1100}
         ),
+        "topic-not-utf-8": raw_publish(0, b"\xc3\x28"),
+        "topic-with-nul": raw_publish(0, b"a\0b"),
+        "topic-with-surrogate": raw_publish(0, b"\xed\xa0\x80"),
+        "topic-wildcard": raw_publish(0, b"a/#"),
+        "topic-plus": raw_publish(0, b"a/+/b"),
+        "payload-format-2": raw_publish(0, b"a", b"\x02\x01\x02x"),
+        "topic-with-control-characters": raw_publish(0, b"a\x85b".decode("latin1").encode()),
+        "aliased-topic-with-nul": raw_publish(0, b"a\0b", b"\x03\x23\0\1x")
+        + raw_publish(0, b"", b"\x03\x23\0\1x"),
+        "user-property-not-utf-8": raw_publish(0, b"a", b"\x07\x26\0\1\xff\0\1bx"),
+        "content-type-with-nul": raw_publish(0, b"a", b"\x04\x03\0\1\0x"),
     },
 )
 def _unusable(visit: Visit, sent: object) -> None:

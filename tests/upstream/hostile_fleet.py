@@ -3,7 +3,8 @@
 For some seconds it does one thing, chosen at random: a misdeed of `hostile.py`, bytes that are not
 what they should be, limits, late or strange acknowledgements. Meanwhile a local client publishes
 what the link has to carry, and another one looks how soon it is answered. In the end the broker is
-good: then all that was acknowledged here has to have come there.
+good: then all that was acknowledged here has to have come there, in order: in every other run it
+never does what lets the link put a message off, and send others first.
 """
 
 from __future__ import annotations
@@ -13,21 +14,23 @@ import contextlib
 import random
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from raw_client import RawClient
 from waiting import until
 
 from appliance.mqtt.codec import V5, Properties, Property
-from appliance.mqtt.packets import Packet, Pingresp, Publish
+from appliance.mqtt.packets import Packet, Pingresp
 from upstream import account
 from upstream.device import HERE, THERE, ApplianceDevice
 from upstream.fake_fleet import FakeFleet, Visit, accept, late, never, refuse, reversed_in
 from upstream.hostile import SCENARIOS
 from upstream.streams import Side, Source, running
+
+W = TypeVar("W", str, Property)
 
 #: What the local client's messages are there.
 EVENTS = f"{THERE}events/one"
@@ -64,8 +67,6 @@ LIMITS: dict[Property, tuple[Any, ...]] = {
     Property.SESSION_EXPIRY_INTERVAL: (1,),
 }
 
-#: No message of the local client is larger.
-LARGEST = 2000
 
 #: Lets links dial again at once (sitecustomize.py).
 HURRIED = Path(__file__).parent / "hurried"
@@ -76,6 +77,8 @@ class Report:
     """How a run went."""
 
     seed: int
+    #: Whether `puts_off` is among what is done: then the order is not looked at.
+    puts_off: bool = False
     seconds: float = 0.0
     steps: int = 0
     connections: int = 0
@@ -94,7 +97,8 @@ class Report:
             f" connections, {self.acknowledged} acknowledged, {self.received} received,"
             f" {self.set_aside} set aside; a local ping takes"
             f" {pings[len(pings) * 99 // 100] * 1e3:.1f} ms (99 %), {pings[-1] * 1e3:.1f} ms at the"
-            f" most; at most {most:.0f} MiB; {len(self.problems)} problems"
+            f" most; at most {most:.0f} MiB; {'some put off' if self.puts_off else 'in order'};"
+            f" {len(self.problems)} problems"
         )
 
 
@@ -115,8 +119,7 @@ class HostileFleet:
         self.random = random.Random(seed)
         self.say = say
         self.doing = "nothing yet"
-        #: Whether the broker did not want a message once, so that others were sent first.
-        self.has_put_off = False
+        self.report.puts_off = self.random.random() < 0.5
         self.over = threading.Event()
         self.fleet: FakeFleet
         self.device: ApplianceDevice
@@ -182,9 +185,6 @@ class HostileFleet:
             await asyncio.sleep(dice.uniform(0.5, 4.0))
             report.steps += 1
             report.problems += [f"{each}: {self.doing}" for each in self._faults()]
-            most = self.fleet.limits.get(Property.MAXIMUM_PACKET_SIZE, LARGEST)
-            if most < LARGEST:  # type: ignore[operator]
-                self.has_put_off = True  # it comes on the next connection, beside what is newer
             if now - told > 60:
                 told = now
                 self.say(str(report))
@@ -211,7 +211,7 @@ class HostileFleet:
         return self.fleet.faults[:3] if self.doing.startswith("limits") else []
 
     def _misdeed(self) -> str:
-        name = self.random.choice(list(SCENARIOS))
+        name = self.random.choice(self._allowed(SCENARIOS))
         SCENARIOS[name].prepare(self.fleet)
         return name
 
@@ -259,7 +259,9 @@ class HostileFleet:
     def _limited(self) -> str:
         dice = self.random
         self.fleet.limits = {
-            limit: dice.choice(values) for limit, values in LIMITS.items() if dice.random() < 0.4
+            limit: dice.choice(LIMITS[limit])
+            for limit in self._allowed(LIMITS)
+            if dice.random() < 0.4
         }
         return f"limits {self.fleet.limits}"
 
@@ -268,18 +270,17 @@ class HostileFleet:
         ways = {
             "late acknowledgements": late(dice.uniform(0.0, 2.0)),
             "acknowledgements in reverse": reversed_in(dice.randrange(2, 90)),
-            "quota exceeded": self._put_off,
+            "quota exceeded": refuse(0x97),
             "a session that there is not": accept,
         }
-        name = dice.choice(list(ways))
+        name = dice.choice(self._allowed(ways))
         self.fleet.acknowledge = ways[name]
         self.fleet.session_present = name.startswith("a session")
         return name
 
-    def _put_off(self, visit: Visit, packet: Publish) -> None:
-        """The link tries it again later, behind what follows."""
-        self.has_put_off = True
-        refuse(0x97)(visit, packet)
+    def _allowed(self, ways: Iterable[W]) -> list[W]:
+        """Those that may be chosen in this run."""
+        return [each for each in ways if self.report.puts_off or not puts_off(each)]
 
     # What has come of it
 
@@ -315,12 +316,19 @@ class HostileFleet:
         report.set_aside = status["set_aside"]
         if len(source.acknowledged - set(numbers)) > report.set_aside:
             report.problems += account.loss(EVENTS, source.acknowledged, numbers)
-        if not self.has_put_off:  # else what was put off comes behind others
+        if not report.puts_off:
             report.problems += account.order(EVENTS, numbers, report.connections)
         report.problems += account.inventions(EVENTS, source.sent, numbers)
         report.problems += account.growth(report.memory, GROWTH)
         if "Traceback" in self.device.log:
             report.problems.append(f"a fault: {self.device.log.partition('Traceback')[2][:2000]}")
+
+
+def puts_off(way: str | Property) -> bool:
+    """Whether it lets the link put a message off: it is too large for now, or is refused."""
+    if isinstance(way, Property):
+        return way is Property.MAXIMUM_PACKET_SIZE
+    return way == "quota exceeded" or way.startswith("puback-code")
 
 
 def garbled(data: bytes, dice: random.Random) -> bytes:

@@ -74,6 +74,8 @@ def test_an_answer_is_not_taken_for_that_of_a_call_below_a_prefix_of_its_own(kin
         assert answers.for_request_in(call, other, 0.0) is None
         assert answers.for_request_in(call, "vehicles/8/other/_reply/42", 0.0)
     assert answers.for_request_in("vehicles/7/reset/_call", "vehicles/7/reset/_reply/1", 0.0)
+    deeper = other.replace("42", "alice/42")  # where a client of MQTT 5 may listen
+    assert answers.for_request_in("fleet/r2/reset/_call", deeper, 0.0) is None
     assert answers.for_request_in(f"vehicles/7/other/{kind}/42", other, 0.0)
 
 

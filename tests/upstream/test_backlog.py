@@ -712,6 +712,24 @@ def test_full_and_refuse_leaves_room_for_what_is_more_urgent() -> None:
     assert 80_000 - 1200 < link.counts().bytes <= 80_000
 
 
+def test_full_and_refuse_takes_a_newer_value_in_place_of_an_older_one() -> None:
+    """What more urgent messages have taken of its room is no reason to send the older one."""
+    link = Link(
+        rule("alarms/#", priority="high"),
+        rule("battery", keep="latest", priority="low"),
+        online=False,
+        size=80_000,
+        when_full="refuse",
+    )
+    assert link.offer("80 %", of=1) is None
+    while link.offer(bytes(1000)) is None:
+        pass
+    assert link.offer("5 % ", of=1) is None
+    assert link.offer("much more than before", of=1), "that needs room"
+    link.backlog.connected()
+    assert [each for each in link.drain() if each[0] != "\0"] == ["5 % "]
+
+
 def test_what_cannot_be_stored_is_refused() -> None:
     link = Link()
     link.backlogs.failing = True

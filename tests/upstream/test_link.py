@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import socket
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from appliance.broker.broker import Broker
 from appliance.broker.limits import Limits
 from appliance.broker.values import Action
 from appliance.mqtt.codec import (
+    V5,
+    V311,
     Properties,
     Property,
     PropertyValue,
@@ -766,8 +769,7 @@ def test_a_broker_that_sends_more_than_we_allow():
 @pytest.mark.parametrize(
     ("wire", "code", "text"),
     [
-        (Publish("a/#", b"x").encode(5), ReasonCode.MALFORMED_PACKET, "+ or #"),
-        (b"\x30\x05\x00\x01\xff\x00x", ReasonCode.MALFORMED_PACKET, "UTF-8"),
+        (b"\x30\x04\x00\x00\x00x", ReasonCode.PROTOCOL_ERROR, "without a topic"),
         (b"\x30\xff\xff\xff\xff", ReasonCode.MALFORMED_PACKET, "four bytes"),
         (b"\x30\xff\xff\xff\x7f", ReasonCode.PACKET_TOO_LARGE, "more than the limit"),
         (
@@ -786,6 +788,32 @@ def test_wrong_bytes_end_the_connection_with_the_reason(wire, code, text):
     (first,) = fake.heard()
     assert isinstance(first, Arrived) and first.topic == "first"
     fake.check_failed(code, text)
+
+
+@pytest.mark.parametrize(
+    ("topic", "flaw"),
+    [
+        (b"a/#", "+ or #"),
+        (b"a\0", "U+0000"),
+        (b"\x7f", "control"),
+        (b"\xff", "UTF-8"),
+        (b"\0\xa0", "UTF-8"),
+    ],
+)
+@pytest.mark.parametrize("version", [V311, V5])
+def test_a_topic_that_its_publisher_has_made_so_ends_nothing(topic, flaw, version):
+    """[MQTT-1.5.3-1] excepted: the broker may pass on what it was sent"""
+    fake = Fake(version=version).open()
+    wire = struct.pack(">H", len(topic)) + topic + (b"\0x" if version == V5 else b"x")
+    for _ in range(2):  # it is not remembered as a good one
+        fake.say(bytes((0x30, len(wire))) + wire)
+    if flaw == "UTF-8" and version == V311:
+        fake.check_failed(ReasonCode.MALFORMED_PACKET, flaw)
+        return
+    fake.say(Publish("last", b"x"))
+    *heard, last = fake.heard()
+    assert [flaw in each.flaw for each in heard] == [True, True]
+    assert last.topic == "last" and not last.flaw and fake.link.ended is None
 
 
 def test_a_disconnect_is_no_larger_than_the_broker_takes():

@@ -17,7 +17,7 @@ from appliance.mqtt.codec import (
     encode_property_list,
     encode_varint,
 )
-from appliance.upstream.publish_properties import PublishProperties
+from appliance.upstream.publish_properties import PublishProperties, printable
 
 
 def slow(
@@ -88,8 +88,7 @@ def test_properties_that_hold_control_characters_are_left_out() -> None:
         Property.CONTENT_TYPE: "\x85",
         Property.USER_PROPERTY: [("a", "b"), ("c\x01", "d"), ("ä", ""), ("c", "\ufffe")],
     }
-    assert PROPERTIES.printable(NO_PROPERTIES) == NO_PROPERTIES
-    for _ in range(2):
-        plain = {name: good[name] for name in good if name != Property.CONTENT_TYPE}
-        for said, sent in ((good, good), (bad, plain), ({Property.CONTENT_TYPE: "\n"}, {})):
-            assert PROPERTIES.printable(encode_properties(said)) == encode_properties(sent)
+    assert printable(NO_PROPERTIES) == NO_PROPERTIES
+    plain = {name: good[name] for name in good if name != Property.CONTENT_TYPE}
+    for said, sent in ((good, good), (bad, plain), ({Property.CONTENT_TYPE: "\n"}, {})):
+        assert printable(encode_properties(said)) == encode_properties(sent)

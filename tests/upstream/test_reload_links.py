@@ -82,6 +82,8 @@ async def test_what_waits_for_a_link_that_has_another_name_now_is_told(tmp_path:
         (link,) = yaml.safe_load(rig.file.read_text())["upstreams"]
         async with running(rig):
             await rig.connected()
+            await publish(rig, "r2d2/events/door", b"sent")
+            await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == [b"sent"])
             await rig.drained()
             assert await reload(rig, {**link, "name": "central"}) and not await told(rig)
             await reload(rig, link)
@@ -98,7 +100,8 @@ async def test_what_waits_for_a_link_that_has_another_name_now_is_told(tmp_path:
             assert await told(rig) == [text]
             await fleet.start()
             await reload(rig, link)
-            await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == [b"waits"])
+            doors = [b"sent", b"waits"]
+            await until(lambda: payloads(fleet, "fleet/r2d2/events/door") == doors)
             assert not await told(rig)
 
 

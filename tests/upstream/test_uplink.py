@@ -191,18 +191,29 @@ async def test_what_the_access_rules_do_not_let_in_is_told(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("qos", [0, 1, 2])
-async def test_what_a_strangers_message_holds_ends_no_link(tmp_path: Path, qos: int) -> None:
+@pytest.mark.parametrize(
+    ("topic", "bad"),
+    [
+        ("fleet/r2d2/cmd/1", {Property.RESPONSE_TOPIC: "a/+/x"}),
+        ("fleet/r2d2/cmd/\x01", {}),
+        ("fleet/r2d2/cmd/\x01", {Property.CONTENT_TYPE: "text/plain"}),
+    ],
+)
+async def test_what_a_strangers_message_holds_ends_no_link(
+    tmp_path: Path, qos: int, topic: str, bad: Properties
+) -> None:
     """Retained, or kept in a session there, it would end each connection."""
-    bad: Properties = {Property.RESPONSE_TOPIC: "a/+/x"}
     async with FakeFleet() as fleet, running(Rig(tmp_path, fleet.port)) as rig:
         await rig.connected()
         visit = await fleet.visited()
         for _ in range(3):
-            visit.message("fleet/r2d2/cmd/1", b"bad", qos, properties=bad, retain=True)
+            visit.message(topic, b"bad", qos, properties=bad, retain=True)
         visit.message("fleet/r2d2/cmd/1", b"good", qos)
         await until(lambda: rig.status().delivered == 1)
         await until(lambda: not visit.sent)
         assert (rig.status().refused, rig.status().connections) == (3, 1)
+        dropped = rig.status().dropped.get("fleet/r2d2/cmd/#")
+        assert dropped == (None if "\x01" in topic else {"refused": 3})  # no rule carries that
         codes = [code for _, code in visit.acknowledged]
         assert codes == ([0x80] * 3 + [0] if qos else []) and not fleet.faults
 

@@ -7,6 +7,11 @@ const MIB = 1024 * 1024
 
 const route = (more) => ({ ros: '/odom', mqtt: 'r/odom', type: 'nav_msgs/msg/Odometry', direction: 'to_mqtt', ...more })
 const bytes = (value) => new TextEncoder().encode(typeof value === 'string' ? value : JSON.stringify(value))
+const all = (about) => {
+  const found = []
+  for (let told = about.told(); told.length > 0; told = about.told()) found.push(...told)
+  return found
+}
 const take = (about, robot, value, what = 'routes') => about.take(`${robot}/_appliance/${what}`, bytes(value))
 
 // Told once, the newest of each; a view's bytes are copied, as MQTT.js writes over them.
@@ -53,19 +58,34 @@ assert.deepEqual(about.told(), [['x7', 'routes', undefined], ['y', 'routes', [ro
 // So many bytes.
 about = new About('r')
 const large = (size) => [route({ why: 'x'.repeat(size) })]
-for (let n = 0; n < 20; n += 1) take(about, `x${n}`, large(3 * MIB))
-assert.equal(about.told().length, 5)
+for (let n = 0; n < 40; n += 1) take(about, `x${n}`, large(0.9 * MIB))
+assert.equal(about.told().length, 1) // in a frame, as the worker also drives
+assert.equal(all(about).length, 16)
 take(about, 'x0', large(10))
-take(about, 'z', large(3 * MIB), 'skipped')
-assert.deepEqual(about.told().map(([robot, what]) => [robot, what]), [['x0', 'routes'], ['z', 'skipped']])
-take(about, 'z', large(4 * MIB))
+take(about, 'z', large(0.9 * MIB), 'skipped')
+assert.deepEqual(all(about).map(([robot, what]) => [robot, what]), [['x0', 'routes'], ['z', 'skipped']])
+take(about, 'z', large(MIB))
 take(about, 'r', large(4 * MIB))
 assert.deepEqual(about.told(), [])
+take(about, 'r', large(3 * MIB))
+assert.equal(about.told()[0][2][0].why.length, 3 * MIB)
+
+// Texts and lists of others, which a page would have to lay out.
+about = new About('r')
+const wide = { last_error: 'x'.repeat(9000), rules: { clamp: Array(200).fill(['x'.repeat(4000)]) } }
+take(about, 'x1', [route(wide), route({ mqtt: 'a'.repeat(1001) }), ...Array(2000).fill(7)])
+take(about, 'x1', { count: 1000, skipped: Array(110).fill({ last_error: wide.last_error }) }, 'skipped')
+const [[, , [cutRoute, ...rest]], [, , cutList]] = all(about)
+assert.deepEqual(
+  [rest.length, cutRoute.last_error.length, cutRoute.rules.clamp.length, cutRoute.rules.clamp[0][0].length, cutRoute.mqtt],
+  [0, 2001, 100, 2001, 'r/odom'],
+)
+assert.deepEqual([cutList.count, cutList.skipped.length, cutList.skipped[0].last_error.length], [1000, 100, 2001])
 
 // So many routes of others, but all of this robot.
 about = new About('r')
 const many = (count) => Array.from({ length: count }, (_, n) => route({ mqtt: `t/${n}` }))
-const counts = () => about.told().map(([, , { length }]) => length)
+const counts = () => all(about).map(([, , { length }]) => length)
 take(about, 'r', many(12000))
 take(about, 'x', many(8000))
 take(about, 'y', many(8000))
@@ -75,7 +95,7 @@ take(about, 'y', many(8000))
 assert.deepEqual(counts(), [1000, 8000])
 take(about, 'x', '{}')
 take(about, 'y', '')
-about.told()
-take(about, 'z', many(12000))
+all(about)
+take(about, 'z', many(11000))
 assert.deepEqual(counts(), [10000])
 console.log('ok')

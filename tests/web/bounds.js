@@ -36,4 +36,15 @@ const focus = new Focus(() => client, null)
 focus.look('t', null)
 for (let n = 0; n < 100; n += 1) focus.take(payload, packet(1024 * KIB), n)
 assert.ok(focus.bytes <= 16 * KIB * KIB && focus.history.length === 16, `${focus.history.length}`)
+
+// What the messages of the history say is larger than they are: it is kept of a few.
+const nested = `{"${Array(60).fill('k'.repeat(200)).join('":{"')}":[${Array(900).fill(1).join()}]${'}'.repeat(60)}`
+const nesting = new Focus(() => client, null)
+nesting.look('t', null)
+for (let n = 0; n < 100; n += 1) {
+  nesting.take(new TextEncoder().encode(nested), packet(nested.length), n)
+  const { message } = await nesting.told()
+  assert.ok(message.leaves.length === 900 && message.leaves.every(([path]) => path.length <= 501))
+}
+assert.ok(nesting.history.length === 100 && nesting.texts.size <= 4)
 console.log('ok')

@@ -174,7 +174,19 @@ def test_a_module_has_no_error_of_syntax(name: str):
 
 
 @pytest.mark.parametrize(
-    "name", ["about", "bounds", "cbor", "formats", "camera", "map", "calls", "schema", "signing"]
+    "name",
+    [
+        "about",
+        "bounds",
+        "cbor",
+        "formats",
+        "camera",
+        "map",
+        "calls",
+        "schema",
+        "signing",
+        "driving",
+    ],
 )
 def test_hostile_payloads(name: str):
     """What reads payloads, in node: exact, bounded, and no key becomes one of an object."""

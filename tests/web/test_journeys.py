@@ -267,6 +267,9 @@ def test_a_gamepad_drives_while_its_button_is_held(
     page.evaluate("pad.connected = false")  # its battery is empty, or its cable is out
     odometry.stands()
     page.evaluate("pad.connected = true")
+    before = odometry.count
+    eventually(lambda: odometry.count > before + 5, "odometry")
+    assert odometry.speed == 0  # the button was held all the time
     until_it_does(4)
     page.evaluate("window.dispatchEvent(new Event('blur'))")
     odometry.stands()

@@ -158,11 +158,13 @@ def _files(link: UpstreamSettings) -> Iterator[Finding]:
     ):
         if path is None:
             continue
-        if not path.exists():
-            yield Finding("error", subject, f"{key}: there is no file {path}; {what}")
-            continue
         try:
+            path.stat()
             load(path)
+        except FileNotFoundError:
+            yield Finding("error", subject, f"{key}: there is no file {path}; {what}")
+        except OSError as error:
+            yield Finding("error", subject, f"{key}: {path} cannot be read: {_reason(error)}")
         except certs.CertificateError as error:
             yield Finding("error", subject, f"{key}: {error}")
 
@@ -175,9 +177,12 @@ def _secret(path: Path) -> str:
         if not first_line(path):
             return "has nothing in its first line, where the secret is to be"
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        return f"cannot be read: {reason}"
+        return f"cannot be read: {_reason(error)}"
     return ""
+
+
+def _reason(error: OSError) -> str:
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _kind(settings: Settings, link: UpstreamSettings) -> Iterator[Finding]:

@@ -8,6 +8,7 @@ const PACKET = 2 * 1024 * 1024
 const TIMEOUT = 10000 // ms for an answer
 const REFUSED = 0x80 // reason codes from here on
 const NO_MATCHING_SUBSCRIBERS = 0x10
+const UNKNOWN = 'The connection was lost: whether it was carried out is not known.'
 
 export class Calls {
   constructor(open) {
@@ -24,7 +25,8 @@ export class Calls {
     this.client.on('error', () => {})
     this.client.on('close', () => {
       this.isOver = true
-      this.fail('The connection was lost: whether it was carried out is not known.')
+      this.fail(UNKNOWN)
+      this.client.end(true) // else who waits for a PUBACK is told nothing
     })
     this.client.on('message', (topic, buffer, packet) => this.take(topic, buffer, packet))
   }
@@ -80,8 +82,8 @@ export class Calls {
     if (known) return known
     const subscribed = new Promise((resolve, reject) => {
       this.client.subscribe(filter, { qos: 1 }, (error, granted, packet) => {
-        const code = packet?.granted?.[0] ?? (error ? REFUSED : 0)
-        if (code < REFUSED) resolve()
+        if (error && !packet) reject(new Error('No connection to the robot now.'))
+        else if (!(packet?.granted?.[0] >= REFUSED)) resolve()
         else reject(new Error(`This user may not read its answers: pattern read ${above}/_reply/%c/#`))
       })
     })
@@ -96,7 +98,8 @@ export class Calls {
     const token = data ? new TextDecoder().decode(data) : topic.slice(topic.lastIndexOf('/') + 1)
     const found = this.waiting.get(token)
     if (!found) return
-    const error = errorIn(text)
+    // Where it says that it is no error, a response may have a field of that name.
+    const error = packet.properties?.userProperties?.status === 'ok' ? '' : errorIn(text)
     if (error) found.reject(new Error(error))
     else found.resolve(text)
   }
@@ -108,7 +111,7 @@ export class Calls {
     return new Promise((resolve, reject) => {
       this.client.publish(topic, payload, { qos, retain, properties }, (error, packet) => {
         const code = packet?.reasonCode ?? error?.code ?? 0
-        if (error && !(code >= REFUSED)) reject(error)
+        if (error && !(code >= REFUSED)) reject(this.isOver ? new Error(UNKNOWN) : error)
         else resolve({ code, words: packet?.properties?.reasonString ?? error?.message ?? '' })
       })
     })

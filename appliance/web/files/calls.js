@@ -4,7 +4,7 @@ import { h } from './vendor/preact.mjs'
 import { useMemo } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { robots } from './link.js'
+import { allRoutes, robot as own, robots } from './link.js'
 import Goals from './goals.js'
 import Parameters from './parameters.js'
 import Service from './service.js'
@@ -16,21 +16,15 @@ const KINDS = [['service', 'Services', Service], ['action', 'Actions', Goals], [
 
 const sought = signal('')
 
-/** What can be called, of all robots. */
-function callable(found) {
+/** What can be called, of all robots, this one's first. */
+function callable() {
   const kinds = KINDS.map(([kind]) => kind)
-  const entries = []
-  for (const [robot, { routes = [] }] of found) {
-    for (const route of routes) {
-      const isWhole = ['ros', 'mqtt', 'type'].every((name) => typeof route?.[name] === 'string')
-      if (isWhole && kinds.includes(route.direction)) entries.push({ ...route, robot })
-    }
-  }
-  return entries.sort((one, other) => (one.ros < other.ros ? -1 : 1))
+  return allRoutes().filter(({ direction }) => kinds.includes(direction))
+    .sort((one, other) => (other.robot === own) - (one.robot === own) || (one.ros < other.ros ? -1 : 1))
 }
 
 export default function Calls({ topic }) {
-  const entries = useMemo(() => callable(robots.value), [robots.value])
+  const entries = useMemo(callable, [robots.value])
   const opened = entries.find(({ mqtt }) => mqtt === topic)
   const [, , Opened] = KINDS.find(([kind]) => kind === opened?.direction) ?? []
   return html`<div class=${`topics ${topic ? 'inspecting' : ''}`}>
@@ -38,6 +32,7 @@ export default function Calls({ topic }) {
     ${topic && html`<section class="inspector" aria-labelledby="opened">
       <div class="tools"><h2 id="opened"><bdi>${opened?.ros ?? topic}</bdi></h2>
         <a class="button" href="#/calls">Close</a></div>
+      ${opened && html`<p class="quiet">Called at <bdi>${opened.mqtt}</bdi>${opened.robot === own ? '' : html`, of <bdi>${opened.robot}</bdi>`}</p>`}
       ${opened ? html`<${Opened} key=${topic} entry=${opened} />`
     : html`<p class="notice">It is not on the bus now, or not bridged.</p>`}</section>`}
   </div>`
@@ -59,8 +54,8 @@ function List({ entries, topic }) {
 function Kind({ label, entries, topic }) {
   if (entries.length === 0) return null
   return html`<h2>${label} <span class="quiet">${entries.length}</span></h2>
-    <ul class="tree">${entries.slice(0, SHOWN).map(({ ros, mqtt, type, direction }) => html`<li key=${mqtt}>
+    <ul class="tree">${entries.slice(0, SHOWN).map(({ ros, mqtt, type, direction, robot }) => html`<li key=${mqtt}>
       <a class="row" href=${`#/calls/${encodeURIComponent(mqtt)}`} aria-current=${mqtt === topic ? 'true' : null}>
-        <bdi class="name">${ros}</bdi><span class="value"><bdi>${direction === 'parameters' ? '' : type}</bdi></span></a></li>`)}
+        <span class="name"><bdi>${ros}</bdi>${robot === own ? '' : html` <span class="quiet">of <bdi>${robot}</bdi></span>`}</span><span class="value"><bdi>${direction === 'parameters' ? '' : type}</bdi></span></a></li>`)}
     ${entries.length > SHOWN && html`<li class="quiet">… ${entries.length - SHOWN} more: search for them</li>`}</ul>`
 }

@@ -4,7 +4,6 @@ import { h } from './vendor/preact.mjs'
 import { useEffect, useRef, useState } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { robots } from './link.js'
 import { routesOf, useWatch } from './live.js'
 import { save } from './save.js'
 
@@ -20,7 +19,7 @@ const rate = signal(5)
 
 /** The routes that carry pictures, with what speaks against showing them. */
 function cameras() {
-  return routesOf(robots.value, ({ type, encoding }) => IMAGE.test(type) || COMPRESSED.test(type)
+  return routesOf(({ type, encoding }) => IMAGE.test(type) || COMPRESSED.test(type)
     || encoding === 'jpeg' || encoding === 'png').map((route) => {
     const { mqtt, type, encoding } = route
     let obstacle = ''

@@ -15,6 +15,7 @@ export class Drive {
     this.parting = null // the connection before, until its stop message is acknowledged
     this.driver = '' // the client id of the connection that drove last
     this.timer = null
+    this.mustLetGo = false // the connection was lost while it drove
     this.state = 'idle'
     this.reason = ''
     this.sent = this.refused = 0
@@ -26,7 +27,8 @@ export class Drive {
 
   /** Connect for a route, so that the first command need not wait for the login. */
   prepare(route) {
-    if (this.client !== null && this.route?.mqtt === route.mqtt) return
+    const isSame = this.route?.mqtt === route.mqtt && this.route.isStamped === route.isStamped
+    if (this.client !== null && isSame) return
     this.leave()
     this.route = route
     this.connect()
@@ -50,6 +52,10 @@ export class Drive {
     })
     client.on('close', () => {
       if (client !== this.client) return
+      if (this.timer !== null) {
+        this.mustLetGo = true
+        this.reason = `${this.reason || 'The connection was lost'}: let go, and hold again.`
+      }
       this.halt()
       this.client = null
       this.state = 'lost'
@@ -57,8 +63,9 @@ export class Drive {
   }
 
   go(linear, angular) {
+    if (this.mustLetGo) return // it has stopped: nothing moves it again but another press
     this.wanted = [linear, angular]
-    this.heard = Date.now()
+    this.heard = [Date.now(), performance.now()]
     this.again()
     if (this.timer !== null) return
     this.reason = ''
@@ -67,7 +74,8 @@ export class Drive {
   }
 
   command() {
-    if (Date.now() - this.heard > PAGE_PATIENCE) {
+    // One clock counts while a device sleeps, the other one is never set.
+    if (Math.max(Date.now() - this.heard[0], performance.now() - this.heard[1]) > PAGE_PATIENCE) {
       this.release()
       this.reason = 'The page did not answer; stopped.'
       return
@@ -114,6 +122,11 @@ export class Drive {
 
   /** Zero, then DISCONNECT: the appliance stops the robot for either of them. */
   release() {
+    if (this.mustLetGo) {
+      this.mustLetGo = false
+      this.reason = ''
+      this.again()
+    }
     if (this.timer === null) return
     this.halt()
     const client = this.client
@@ -143,6 +156,7 @@ export class Drive {
   leave() {
     if (this.timer !== null && this.client?.connected) this.publish(0, 0)
     this.halt()
+    this.mustLetGo = false
     const client = this.client
     this.client = null
     this.route = null

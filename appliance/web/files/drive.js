@@ -57,15 +57,20 @@ function scaled(part, [low, high], share) {
 export default function Drive() {
   const found = drivable()
   const [chosen, choose] = useState('')
-  const route = found.find(({ mqtt }) => mqtt === chosen) ?? found.find(({ obstacle }) => !obstacle) ?? found[0]
-  if (route === undefined) {
+  const first = (found.find(({ obstacle }) => !obstacle) ?? found[0])?.mqtt ?? ''
+  // The one that was shown stays the one: who holds a button does not mean another machine.
+  useEffect(() => { if (!chosen) choose(first) }, [chosen, first])
+  const route = found.find(({ mqtt }) => mqtt === (chosen || first))
+  if (found.length === 0) {
     return html`<h1>Drive</h1><p class="notice">No route to ROS of type geometry_msgs/msg/Twist or
       TwistStamped is known. It may not be bridged, or this user may not read {robot}/_appliance/routes.</p>`
   }
   return html`<h1>Drive</h1>
-    ${found.length > 1 && html`<label>Route <select value=${route.mqtt} onChange=${(event) => choose(event.currentTarget.value)}>
+    ${(found.length > 1 || !route) && html`<label>Route <select value=${route?.mqtt ?? ''} onChange=${(event) => choose(event.currentTarget.value)}>
+      ${!route && html`<option value="">Choose one</option>`}
       ${found.map(({ mqtt }) => html`<option key=${mqtt} value=${mqtt}>${mqtt}</option>`)}</select></label>`}
-    <${Control} key=${route.mqtt} route=${route} />`
+    ${route ? html`<${Control} key=${route.mqtt} route=${route} />`
+    : html`<p class="notice bad" role="alert"><bdi>${chosen}</bdi> is not bridged now.</p>`}`
 }
 
 function Control({ route }) {
@@ -113,7 +118,7 @@ function Control({ route }) {
       hold.end()
       tell('leave')
     }
-  }, [route.mqtt, route.obstacle])
+  }, [route.mqtt, route.isStamped, route.obstacle])
 
   const words = route.obstacle || told?.reason || ''
   const [linear, angular] = speed
@@ -157,7 +162,7 @@ class Hold {
     this.sent = 0
     this.keys = new Set()
     this.pointer = null
-    this.isFree = true // the dead-man button was seen open
+    this.isFree = false // whether the dead-man button was seen open: one that is held already drives nothing
   }
 
   start() {
@@ -224,7 +229,7 @@ class Hold {
 
   pointerMove(event, element) {
     if (event.pointerId !== this.pointer) return
-    if (event.buttons === 0) this.release()
+    if (!(event.buttons & 1)) this.release() // where others are held, there is no pointerup for the first
     else this.steer(event, element)
   }
 
@@ -240,8 +245,10 @@ class Hold {
   }
 
   keyDown(event) {
-    if (event.code === 'Escape') this.release()
-    if (!Object.hasOwn(KEYS, event.code) || event.ctrlKey || event.altKey || event.metaKey) return
+    // With Cmd held, macOS tells nobody that another key is let go.
+    const isModified = event.ctrlKey || event.altKey || event.metaKey
+    if (event.code === 'Escape' || isModified) this.release()
+    if (!Object.hasOwn(KEYS, event.code) || isModified) return
     event.preventDefault()
     if (event.repeat && !this.keys.has(event.code)) return // held since before a stop
     this.keys.add(event.code)
@@ -260,12 +267,13 @@ class Hold {
     this.take('keys', part(0), part(1))
   }
 
+  /** Browsers tell of gamepads in windows without the focus, too: only the one with it drives. */
   gamepad() {
-    const pad = (navigator.getGamepads?.() ?? []).find((each) => each?.connected)
-    const isHeld = Boolean(pad) && DEAD_MAN.some((button) => pad.buttons[button]?.pressed)
-    if (!isHeld) {
+    const pads = document.hasFocus() ? [...(navigator.getGamepads?.() ?? [])].filter((each) => each?.connected) : []
+    const pad = pads.find(({ buttons }) => DEAD_MAN.some((button) => buttons[button]?.pressed))
+    if (pad === undefined) {
       if (this.by === 'gamepad') this.release()
-      this.isFree = true
+      if (pads.length > 0) this.isFree = true
       return
     }
     if (!this.isFree) return

@@ -53,5 +53,5 @@ function Code({ begun: { user, url, seconds, qr } }) {
     <svg viewBox=${`${-QUIET} ${-QUIET} ${side} ${side}`} role="img" aria-label="QR code" shape-rendering="crispEdges">
       <rect x=${-QUIET} y=${-QUIET} width=${side} height=${side} fill="#ffffff" /><path d=${qr.path} fill="#000000" /></svg>
     <figcaption>For <bdi>${shown(user)}</bdi>: ${Math.floor(left / 60)}:${String(left % 60).padStart(2, '0')} left. Whoever
-      reads it sets the password.<br /><a href=${url}>The same as a link</a></figcaption></figure>`
+      reads it sets the password.<br /><a href=${url} target="_blank" rel="noopener">The same as a link</a></figcaption></figure>`
 }

@@ -20,8 +20,10 @@ export default function Enrol({ topic }) {
   const act = async (fields) => {
     const chosen = fields.password.value
     const { user, mqtt_port: port, p12, problem } = await exchange(code, chosen)
-    setDone({ user, port, password: chosen, url: p12 && download(p12), problem })
-    signIn(user, chosen).catch(() => {})
+    // Else this page would have in its memory what another user has seen.
+    const isOthers = ['in', 'lost'].includes(session.peek().name)
+    setDone({ user, port, password: chosen, url: p12 && download(p12), problem, isOthers })
+    if (!isOthers) signIn(user, chosen).catch(() => {})
   }
   return html`<main class="sign-in"><h1>${location.hostname}</h1>
     ${done !== null ? html`<${Done} done=${done} />` : !code ? html`<p class="notice bad" role="alert">The code is not
@@ -35,9 +37,10 @@ export default function Enrol({ topic }) {
   </main>`
 }
 
-function Done({ done: { user, port, password, url, problem } }) {
+function Done({ done: { user, port, password, url, problem, isOthers } }) {
   const { name, reason } = session.value
   return html`<p class="good" role="status">The password is set. Keep it: it is not shown again.</p>
+    ${isOthers && html`<p class="notice">This window stays signed in as another user.</p>`}
     ${name === 'in' ? html`<p><a class="button" href="#/overview">To the console</a></p>`
     : html`<p class=${reason ? 'notice bad' : 'quiet'}>${reason || 'Signing in …'}</p>`}
     <section class="facts"><h2>For MQTT apps</h2><dl class="properties">

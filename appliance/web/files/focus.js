@@ -7,6 +7,7 @@ const FOCUS_RATE = '30'
 const ABOUT_RATE = '2'
 const HISTORY = 200 // messages
 const HISTORY_BYTES = 16 * 1024 * 1024 // of them, with their properties
+const DECODED = 4 // messages of which it is kept what they say: the one that is shown, and the one before
 const POINTS = 3000
 const SMALL = 64 * 1024 // bytes of a message of which every one is plotted
 
@@ -23,12 +24,13 @@ export class Focus {
     client.on('error', () => {})
     client.on('message', (topic, buffer, packet) => {
       about.take(topic, buffer)
-      if (topic === this.topic) this.take(Uint8Array.from(buffer), packet, Date.now())
+      if (topic === this.topic) this.take(new Uint8Array(buffer), packet, Date.now())
     })
   }
 
   clear() {
     this.history = []
+    this.texts = new Map() // message → what it says, of those that were shown last
     this.bytes = 0
     this.number = 0
     this.path = null
@@ -48,7 +50,7 @@ export class Focus {
     const properties = { userProperties: { 'max-rate': FOCUS_RATE } }
     this.client.subscribe(topic, { qos: 0, properties }, (error, granted, packet) => {
       if (topic !== this.topic) return
-      const code = packet?.granted?.[0] ?? (error ? 0x80 : 0)
+      const code = packet?.granted?.[0] ?? 0 // without a packet the connection was lost
       this.reason = code >= 0x80 ? 'This user may not read this topic.' : ''
       this.isNew = true
     })
@@ -104,11 +106,16 @@ export class Focus {
     if (this.points.length > POINTS) this.points.shift()
   }
 
+  /** What a message says. A few are kept: they are larger than the messages, which are counted. */
   decoded(entry) {
-    entry.decoded ??= decode(entry.payload, entry.properties).catch((error) => ({
+    const known = this.texts.get(entry)
+    if (known) return known
+    if (this.texts.size >= DECODED) this.texts.delete(this.texts.keys().next().value)
+    const text = decode(entry.payload, entry.properties).catch((error) => ({
       kind: 'text', note: `cannot be shown: ${error?.message ?? error}`, text: '',
     }))
-    return entry.decoded
+    this.texts.set(entry, text)
+    return text
   }
 
   async plot(path) {

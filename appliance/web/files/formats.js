@@ -7,6 +7,7 @@ export const LEAVES = 1000 // values of one message that are shown
 const DEPTH = 64
 const TEXT = 64 * 1024 // characters of a text
 const VALUE = 2000 // characters of one value
+const PATH = 500 // characters of where it is
 const HEX = 4096 // bytes of a hex dump
 const INFLATED = 10 * 1024 * 1024 // bytes that a compressed payload may have
 
@@ -124,8 +125,11 @@ export function leavesOfJson(text) {
   let note = ''
   const here = () => {
     let path = ''
-    for (const level of stack) path += level.isArray ? `[${level.count}]` : `${path ? '.' : ''}${level.key}`
-    return path
+    for (const level of stack) {
+      path += level.isArray ? `[${level.count}]` : `${path ? '.' : ''}${level.key}`
+      if (path.length > PATH) break
+    }
+    return cut(path, PATH)
   }
   const add = (value) => {
     leaves.push([here(), cut(value, VALUE), value[0] === '"' ? null : number(value)])
@@ -215,7 +219,8 @@ function leavesOfCbor(bytes) {
       for (const [key, inner] of value.entries()) {
         if (some.length > LEAVES) break
         const name = cut(String(key), 200)
-        some.push([isArray ? `${path}[${name}]` : `${path}${path ? '.' : ''}${name}`, inner, depth + 1])
+        const inside = isArray ? `${path}[${name}]` : `${path}${path ? '.' : ''}${name}`
+        some.push([path.length > PATH ? path : cut(inside, PATH), inner, depth + 1])
       }
       waiting.push(...some.reverse())
     }

@@ -15,6 +15,25 @@ export const untold = signal(0)
 /** The name of this robot, as its server says. Others' topics may be anybody's. */
 export const robot = document.querySelector('meta[name=robot]').content
 export const robots = signal(new Map()) // robot → {routes, skipped}
+/**
+ * All routes, with `robot`, whose they are: this robot's first. Others' topics may be anybody's, so that what
+ * they say of a topic of this robot, or of one that another robot has named before, does not count.
+ */
+export function allRoutes() {
+  const named = new Map() // topic → whose
+  const found = []
+  const add = (name) => {
+    for (const route of robots.value.get(name)?.routes ?? []) {
+      if ((named.get(route.mqtt) ?? name) !== name) continue
+      named.set(route.mqtt, name)
+      found.push({ ...route, robot: name })
+    }
+  }
+  add(robot)
+  for (const name of robots.value.keys()) if (name !== robot) add(name)
+  return found
+}
+
 export const inspected = signal(null)
 export const drive = signal(null)
 /** What is kept for the open page: topics with {text, isJson, size, rate, at}, and filters that were refused. */
@@ -192,6 +211,7 @@ export async function verb(name, values = {}, timeout = undefined) {
 /** Sign in with a password, or with the token of a page before this one. */
 export function signIn(name, password, token) {
   const url = `${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/mqtt`
+  if (token === undefined) keep(null) // one of somebody else, who was not signed out
   user.value = name
   session.value = { name: 'connecting', reason: '' }
   return ask('signIn', { url, user: name, password, token, robot })

@@ -1,7 +1,7 @@
 // What a page watches while it is open and can be seen: nothing comes for a page that is hidden.
 
 import { useEffect } from './vendor/hooks.mjs'
-import { ask, tell } from './link.js'
+import { allRoutes, ask, robot as own, tell } from './link.js'
 
 /**
  * Watch what `values` say, null for nothing; `take` gets one answer after the other.
@@ -43,14 +43,8 @@ export function useWatch(values, take) {
   }, [JSON.stringify(values)])
 }
 
-/** The routes to MQTT of certain types or encodings, of all robots, by their topics. */
-export function routesOf(robots, isWanted) {
-  const found = []
-  for (const { routes } of robots.values()) {
-    for (const route of routes ?? []) {
-      if (route?.direction !== 'to_mqtt' || typeof route.mqtt !== 'string') continue
-      if (typeof route.type === 'string' && isWanted(route)) found.push(route)
-    }
-  }
-  return found.sort((one, other) => (one.mqtt < other.mqtt ? -1 : 1))
+/** The routes to MQTT of certain types or encodings, of all robots, by their topics: this one's first. */
+export function routesOf(isWanted) {
+  return allRoutes().filter((route) => route.direction === 'to_mqtt' && isWanted(route))
+    .sort((one, other) => (other.robot === own) - (one.robot === own) || (one.mqtt < other.mqtt ? -1 : 1))
 }

@@ -171,10 +171,11 @@ async function caFingerprint() {
   return Array.from(digest, (byte) => byte.toString(16).padStart(2, '0').toUpperCase()).join(':')
 }
 
+const READY_WITHIN = 4000 // ms, less than until it is asked again
 const PARTS = { mqtt: 'MQTT', store: 'Store', ros: 'ROS', upstream: 'Fleet' }
 
 async function readiness() {
-  const answer = await fetch('/readyz')
+  const answer = await fetch('/readyz', { signal: AbortSignal.timeout(READY_WITHIN) })
   return Object.entries(await answer.json())
     .filter(([part]) => Object.hasOwn(PARTS, part))
     .map(([part, state]) => [PARTS[part], String(state)])

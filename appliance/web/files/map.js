@@ -3,7 +3,6 @@
 import { h } from './vendor/preact.mjs'
 import { useEffect, useRef, useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
-import { robots } from './link.js'
 import { routesOf, useWatch } from './live.js'
 import { arranged } from './arrange.js'
 import { MapCanvas } from './map-canvas.js'
@@ -22,14 +21,14 @@ const NONE = '-' // which is no MQTT topic of a route
 
 /** Of each part the routes that carry it. */
 function found() {
-  return Object.fromEntries(PARTS.map(([part, , types]) => [part, routesOf(robots.value, ({ type }) => types.test(type))]))
+  return Object.fromEntries(PARTS.map(([part, , types]) => [part, routesOf(({ type }) => types.test(type))]))
 }
 
 /** The topics with transforms of the robots that these topics are of: [topic, whether they are static] each. */
 function transformsOf(topics) {
   const wanted = Object.values(topics)
-  const of = [...robots.value].filter(([, { routes }]) => (routes ?? []).some((route) => wanted.includes(route?.mqtt)))
-  return routesOf(new Map(of), (route) => TF.test(route.type) && isRead(route))
+  const of = new Set(routesOf(({ mqtt }) => wanted.includes(mqtt)).map(({ robot }) => robot))
+  return routesOf((route) => of.has(route.robot) && TF.test(route.type) && isRead(route))
     .slice(0, MOST_TF).map(({ mqtt, ros }) => [mqtt, /static$/.test(ros)])
 }
 

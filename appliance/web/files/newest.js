@@ -33,7 +33,7 @@ export class Newest {
     const size = packet.length ?? buffer.length // of all that the packet says
     entry.isWhole = this.kept + size <= KEPT
     // A copy: the buffer is a view of all that has come with it.
-    entry.payload = Uint8Array.from(entry.isWhole ? buffer : buffer.subarray(0, CUT))
+    entry.payload = new Uint8Array(entry.isWhole ? buffer : buffer.subarray(0, CUT))
     entry.properties = (entry.isWhole && packet.properties) || {}
     entry.held = entry.isWhole ? size : 0
     this.kept += entry.held

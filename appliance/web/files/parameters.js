@@ -57,7 +57,8 @@ export default function Parameters({ entry }) {
     try {
       if (isOne) await request(`${mqtt}/${name}/set`, value, patience(entry))
       else await request(`${mqtt}/_set`, print(new Map(values.map(([each, text]) => [each, parse(text)]))), patience(entry))
-      setDrafts(new Map())
+      // What was written meanwhile stays.
+      setDrafts((now) => new Map([...now].filter(([name, { text }]) => drafts.get(name)?.text !== text)))
       setState({ isBusy: false, error: '', done: values.length === 1 ? `${name} is set.` : `${values.length} parameters are set.` })
     } catch (error) {
       setState({ isBusy: false, error: error.message, done: '' })
@@ -68,7 +69,7 @@ export default function Parameters({ entry }) {
     if (value === edited(type, text)) next.delete(name)
     else next.set(name, { type, text: value })
     setDrafts(next)
-    setState({ isBusy: false, error: '', done: '' })
+    setState(({ isBusy }) => ({ isBusy, error: '', done: '' }))
   }
   const lacksSeveral = changed.length > 1 && several
   return html`

@@ -4,7 +4,7 @@
 import { h } from './vendor/preact.mjs'
 import { useState } from './vendor/hooks.mjs'
 import htm from './vendor/htm.mjs'
-import { ask, robots } from './link.js'
+import { allRoutes, ask } from './link.js'
 import { lack, Lacking, schemaOf, useRights, useShelf } from './calling.js'
 import { Editor, mayBeSent, useMessage, withoutEnter } from './editor.js'
 
@@ -22,11 +22,10 @@ const ANSWERS = {
   0x87: 'Not authorized', 0x90: 'Topic name invalid', 0x97: 'Quota exceeded', 0x99: 'Payload format invalid',
 }
 
-/** The routes of all robots, those to ROS first. */
+/** The routes of topics of all robots, those to ROS first. */
 function routesOf() {
-  const found = [...robots.value].flatMap(([robot, { routes = [] }]) => routes
+  const found = allRoutes()
     .filter(({ direction, encoding }) => ['to_ros', 'to_mqtt'].includes(direction) && typeof encoding === 'string')
-    .map((route) => ({ ...route, robot })))
   return found.sort((one, other) => (other.direction === 'to_ros') - (one.direction === 'to_ros'))
 }
 
@@ -102,7 +101,7 @@ function About({ route, format, schema, root, refused }) {
   if (!route) return html`<p class="quiet">No route of the bridge has this topic.</p>`
   return html`<p class="quiet">${route.direction === 'to_ros' ? 'To' : 'From'} ROS: <bdi>${route.ros}</bdi>, <bdi>${route.type}</bdi>${
     format === 'base64' ? `, in ${route.encoding}: bytes are given as base64` : ''}.
-    ${route.rules?.commanding && html` Commanding now: <strong><bdi>${route.rules.commanding}</bdi></strong>.`}</p>
+    ${typeof route.rules?.commanding === 'string' && html` Commanding now: <strong><bdi>${route.rules.commanding}</bdi></strong>.`}</p>
     ${refused.length > 0 && html`<p class="notice">Without its schema there is no form${
       format === 'cbor' ? ', and bytes go as base64' : ''}. The access rules would need the line:
       <code>topic read ${refused[0]}</code></p>`}

@@ -4,7 +4,7 @@ import { h } from './vendor/preact.mjs'
 import { useMemo } from './vendor/hooks.mjs'
 import { signal } from './vendor/signals.mjs'
 import htm from './vendor/htm.mjs'
-import { robots } from './link.js'
+import { robot as own, robots } from './link.js'
 import { Refused, useShelf } from './calling.js'
 import { counted, size } from './formats.js'
 import { valueOf } from './json-text.js'
@@ -42,6 +42,7 @@ function plain(route) {
   for (const name of COUNTS) {
     if (!Number.isFinite(route[name])) route[name] = undefined
   }
+  if (typeof route.last_error !== 'string') route.last_error = ''
   const { p50, p99 } = route.latency_ms ?? {}
   return { ...route, p50, p99: Number.isFinite(p99) ? p99 : undefined }
 }
@@ -72,7 +73,8 @@ function figuresIn(text) {
 
 export default function Routes({ topic: chosen }) {
   const { all, told } = useRoutes()
-  const route = all.find(({ key }) => key === chosen)
+  const named = all.filter(({ key }) => key === chosen)
+  const route = named.find(({ robot }) => robot === own) ?? named[0]
   const skipped = [...robots.value].flatMap(([, about]) => (Array.isArray(about.skipped?.skipped) ? about.skipped.skipped : []))
   return html`<h1>Routes</h1>
     <${Refused} told=${told} />
@@ -136,7 +138,7 @@ function Details({ route }) {
       ${isToRos && html`<a class="button" href=${`#/publish/${link}`}>Publish</a>`}</div>
     ${route.last_error && html`<p class="notice bad"><bdi>${route.last_error}</bdi></p>`}
     <dl class="properties">${[...factsOf(route), ...(isToRos ? rulesOf(route.rules) : [])].map(([name, value]) => html`
-      <div key=${name}><dt>${name}</dt><dd><bdi>${value}</bdi></dd></div>`)}</dl>
+      <div key=${name}><dt>${name}</dt><dd><bdi>${shown(value)}</bdi></dd></div>`)}</dl>
   </section>`
 }
 

@@ -42,10 +42,11 @@ export class Shelf {
 
   subscribe() {
     const run = this.run
+    this.refused = []
     for (const [filter, rate] of this.wanted) {
       const properties = { userProperties: { 'max-rate': String(rate) } }
       this.client.subscribe(filter, { qos: 0, properties }, (error, granted, packet) => {
-        const code = packet?.granted?.[0] ?? (error ? 0x80 : 0)
+        const code = packet?.granted?.[0] ?? 0 // without a packet the connection was lost
         if (run === this.run && code >= 0x80) this.refused.push(filter)
       })
     }
@@ -64,9 +65,9 @@ export class Shelf {
     this.topics.set(topic, entry)
     const isRoom = this.bytes + buffer.length <= BYTES
     // A copy: the buffer is a view of all that has come with it.
-    entry.payload = Uint8Array.from(isRoom ? buffer : buffer.subarray(0, 256))
+    entry.payload = new Uint8Array(isRoom ? buffer : buffer.subarray(0, 256))
     this.bytes += entry.payload.length
-    entry.properties = packet.properties ?? {}
+    entry.properties = kindOf(packet.properties ?? {})
     entry.size = buffer.length
     entry.at = Date.now()
     entry.count += 1
@@ -114,6 +115,12 @@ async function words({ payload, properties, size: length }) {
   }
   const lines = leaves?.map(([path, value]) => (path ? `${path}: ${value}` : value)).join('\n')
   return { text: cut(lines ?? text ?? kind, TEXT), isJson: false }
+}
+
+/** The properties that say what a payload is: others may be as large as it likes. */
+function kindOf({ contentType = '', userProperties }) {
+  const encoding = String(userProperties?.['content-encoding'] ?? '')
+  return { contentType: cut(contentType, 100), userProperties: { 'content-encoding': cut(encoding, 100) } }
 }
 
 /** Whether a topic is under a filter. */

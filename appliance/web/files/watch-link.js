@@ -23,7 +23,7 @@ export class Watch {
       for (const [topic, rate] of wanted) {
         const properties = rate ? { userProperties: { 'max-rate': String(rate) } } : {}
         client.subscribe(topic, { qos: 0, properties }, (error, granted, packet) => {
-          const code = packet?.granted?.[0] ?? (error ? 0x80 : 0)
+          const code = packet?.granted?.[0] ?? 0 // without a packet the connection was lost
           if (code >= 0x80) say(refusal(topic, code))
         })
       }

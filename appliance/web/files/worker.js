@@ -69,7 +69,11 @@ function options(more, packet) {
 export function open(more, packet) {
   const client = mqtt.connect(login.url, options(more, packet))
   client.on('error', ({ code }) => {
-    if (!WRONG.includes(code) || !client.options.password?.startsWith(TOKEN)) return
+    if (!WRONG.includes(code)) return
+    if (!client.options.password?.startsWith(TOKEN)) {
+      client.end(true) // asking again and again would only count as wrong passwords
+      return
+    }
     if (login?.token === client.options.password) tokenHasEnded()
     // With the password, and without a pause: it is the robot's computer that has started again.
     if (login !== null && client.options.reconnectPeriod) setTimeout(() => client.reconnect())
@@ -108,7 +112,7 @@ function subscribe(client, filters, rate) {
   const properties = rate ? { userProperties: { 'max-rate': rate } } : {}
   return new Promise((resolve) => {
     client.subscribe(filters, { qos: 0, properties }, (error, granted, packet) => {
-      resolve(packet?.granted ?? (error ? [0x80] : []))
+      resolve(packet?.granted ?? []) // without a packet the connection was lost
     })
   })
 }
@@ -207,13 +211,29 @@ function unwatch() {
 
 setInterval(() => newest.measure(), 1000)
 
-async function frame() {
-  const told = { state, rows: newest.rows(), untold: newest.untold, token: login?.token ?? null }
-  told.about = about?.told() ?? []
-  told.focus = (await focus?.told()) ?? null
-  told.drive = drive?.told() ?? null
-  told.shelf = (await shelf?.told()) ?? null
+const SOON = 30 // ms that a frame waits for what takes a file to be loaded, or a picture to be decoded
+const asked = new WeakMap() // focus or shelf → the promise of its answer
+const answered = new WeakMap() // focus or shelf → its answer, which no frame has taken yet
+
+/** What a part has told since it was asked last; null while that is not known. */
+async function soon(part) {
+  if (part === null) return null
+  if (!asked.has(part) && !answered.has(part)) {
+    asked.set(part, part.told().then((told) => answered.set(part, told), () => {}).finally(() => asked.delete(part)))
+  }
+  await Promise.race([asked.get(part), new Promise((resolve) => { setTimeout(resolve, SOON) })])
+  const told = answered.get(part) ?? null
+  answered.delete(part)
   return told
+}
+
+async function frame() {
+  const told = { focus: await soon(focus), shelf: await soon(shelf) }
+  told.rows = newest.rows()
+  told.untold = newest.untold
+  told.about = about?.told() ?? []
+  told.drive = drive?.told() ?? null
+  return { ...told, state, token: login?.token ?? null }
 }
 
 /** The connection for calls, with its module: most visitors never need it. */
