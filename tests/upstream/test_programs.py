@@ -76,10 +76,14 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("brief")
-def test_a_broker_that_does_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("seed", "puts_off"), [(1, True), (2, False)])
+def test_a_broker_that_does_anything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, puts_off: bool
+) -> None:
     """A few seconds of it; `python tests/upstream --hostile 5` for minutes, and for pings."""
     monkeypatch.setattr(hostile_fleet, "ANSWERED", PATIENCE)
-    report = HostileFleet(tmp_path, 1, seconds=6.0).run()
+    report = HostileFleet(tmp_path, seed, seconds=6.0).run()
+    assert report.puts_off == puts_off
     assert not report.problems, f"{report}\n" + "\n".join(report.problems)
     assert report.steps > 1 and report.connections > 2
     assert report.acknowledged > 50 and report.received >= report.acknowledged
