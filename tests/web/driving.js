@@ -51,6 +51,15 @@ assert.equal(sent.length, 2)
 drive.release()
 assert.deepEqual(sent.at(-1).linear.x, 0)
 
+// Who has left the page has let go, and is told nothing of it.
+drive.prepare({ mqtt: 'r/cmd_vel', isStamped: false })
+connect(clients.at(-1))
+drive.go(1, 0)
+lose(clients.at(-1))
+drive.leave()
+assert.equal(drive.reason, '')
+drive.prepare({ mqtt: 'r/cmd_vel', isStamped: false })
+
 // Where the login is refused, each press asks once.
 const before = clients.length
 for (let press = 0; press < 3; press += 1) {

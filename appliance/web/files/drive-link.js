@@ -156,6 +156,7 @@ export class Drive {
   leave() {
     if (this.timer !== null && this.client?.connected) this.publish(0, 0)
     this.halt()
+    if (this.mustLetGo) this.reason = ''
     this.mustLetGo = false
     const client = this.client
     this.client = null
