@@ -208,6 +208,11 @@ class Channel:
             self.connection.reauthenticate(data)
         self.write(self._loop.time())
 
+    def gather(self, seconds: float) -> None:
+        """Let what comes in so many seconds come at once, see `UpstreamTransport.gather`."""
+        if self._transport is not None:
+            self._transport.gather(seconds)
+
     def send_on(self) -> None:
         """There may be more to send, and room for it."""
         if not self._has_ended:

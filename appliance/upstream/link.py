@@ -194,6 +194,11 @@ class FleetConnection(Generic[T]):
         return self._freshness.left_after(0)
 
     @property
+    def window(self) -> int:
+        """Messages of QoS 1 that may be in flight; 0 before CONNACK and after the end."""
+        return self._window
+
+    @property
     def room(self) -> int:
         """Messages of QoS 1 that may be sent now."""
         return max(0, self._window - len(self._inflight))

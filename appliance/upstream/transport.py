@@ -137,6 +137,9 @@ class UpstreamTransport:
         self._copy: socket.socket | None = None
         self._cut: asyncio.TimerHandle | None = None
         self._look_timer: asyncio.TimerHandle | None = None
+        self._gather_timer: asyncio.TimerHandle | None = None
+        #: The descriptor of the socket, which costs as much to ask for as the system call on it.
+        self._descriptor = -1
         self._lingering: LingeringClose | None = None
 
     def __str__(self) -> str:
@@ -198,6 +201,8 @@ class UpstreamTransport:
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The connection is there."""
         self._transport = cast(asyncio.Transport, transport)
+        with contextlib.suppress(AttributeError):  # no socket
+            self._descriptor = transport.get_extra_info("socket").fileno()
         # What the system does not take at once pauses writing.
         self._transport.set_write_buffer_limits(high=0)
         if self._is_closing:  # given up meanwhile
@@ -208,9 +213,17 @@ class UpstreamTransport:
     @contained("upstream.chunk")
     def data_received(self, data: bytes) -> None:
         """Hand the chunk on, now or in turns."""
+        is_small = len(data) <= PORTION
+        waits = self._backlog or self._queued or self._held or self._owner is None
+        if is_small and not waits and not self._scheduler.must_wait(self, is_small=True):
+            # As below, without the parts that a chunk of one portion does not need.
+            assert self._owner is not None
+            self._more = self._owner.received(data)
+            if self._more:
+                self._take_later()
+            return
         self._backlog = memoryview(bytes(self._backlog) + data if self._backlog else data)
-        waits = self._queued or self._held or self._owner is None
-        if waits or self._scheduler.must_wait(self, is_small=len(data) <= PORTION):
+        if waits or self._scheduler.must_wait(self, is_small=is_small):
             self._take_later()
         else:
             self._take()
@@ -250,11 +263,15 @@ class UpstreamTransport:
         self._queued = False
         self._take()
         self._count_backlog()
-        if self._backlog or self._more or self._held:
-            return
-        if self._is_lost:
+        if self._is_lost and not (self._backlog or self._more or self._held):
             self._end()
-        elif self._transport is not None and not self._is_closing:
+        else:
+            self._read_on()
+
+    def _read_on(self) -> None:
+        """Receive again, if nothing speaks against it."""
+        waits = self._backlog or self._more or self._held or self._gather_timer is not None
+        if not (waits or self._is_closing) and self._transport is not None:
             self._transport.resume_reading()
 
     def _count_backlog(self) -> None:
@@ -272,6 +289,19 @@ class UpstreamTransport:
         if self._held:
             self._held = False
             self._queue()
+
+    def gather(self, seconds: float) -> None:
+        """Receive nothing for so long: what comes meanwhile is then received at once, for the cost
+        of one round of the event loop."""
+        if self._gather_timer is None and self._transport is not None and not self._is_closing:
+            self._gather_timer = self._entries.later(
+                "upstream.gather", seconds, self._gathered, served=self, failed=self.abort
+            )
+            self._transport.pause_reading()
+
+    def _gathered(self) -> None:
+        self._gather_timer = None
+        self._read_on()
 
     # --- bytes out -----------------------------------------------------------------------------
 
@@ -298,10 +328,11 @@ class UpstreamTransport:
     def _unsent(self) -> int:
         """Bytes in the system that were never sent; 0 where it does not tell."""
         assert self._transport is not None
+        if self._descriptor < 0 or self._transport.is_closing():  # it may be another's by now
+            return 0
         try:
-            number = self._transport.get_extra_info("socket").fileno()
-            (size,) = struct.unpack("i", fcntl.ioctl(number, _OUTQNSD, b"\0\0\0\0"))
-        except (OSError, ValueError, AttributeError):
+            (size,) = struct.unpack("i", fcntl.ioctl(self._descriptor, _OUTQNSD, b"\0\0\0\0"))
+        except OSError:
             return 0
         return int(size)
 
@@ -400,7 +431,7 @@ class UpstreamTransport:
         self._end_soon()
 
     def _release(self) -> None:
-        for timer in (self._cut, self._look_timer):
+        for timer in (self._cut, self._look_timer, self._gather_timer):
             if timer is not None:
                 timer.cancel()
         self._count("below", 0)

@@ -58,6 +58,11 @@ CLOCK_STEP: Final = 0.001
 #: Seconds for which the fleet's broker is asked to keep the session of rules with `offline: keep`.
 KEPT_EXPIRY: Final = 7 * 86400
 
+#: Seconds for which acknowledgements are gathered while the window is full, if it is so large that
+#: thousands come in a second. Read one by one they would cost a round of the event loop each.
+GATHER: Final = 0.002
+LEAST_GATHERED: Final = 256
+
 #: What CONNECT announces. Explicitly, because mosquitto otherwise has no more than 20 messages in
 #: flight; and so large, because mosquitto exceeds a smaller one when a session is resumed. What is
 #: read at once is bounded by `InSession`, which pauses reading.
@@ -241,14 +246,19 @@ class Uplink:
 
     def send_more(self, channel: Channel) -> None:
         """See `ChannelOwner`."""
-        if channel is not self._lines[0].channel or not channel.can_send:
+        connection = channel.connection
+        if channel is not self._lines[0].channel or not connection.room or not channel.can_send:
             return
         self._state.send(channel)
         if not self._state.is_settled:
             return  # so that an end of the connection is not taken for that of a message
-        if self._sender.send(channel.connection):
+        if self._sender.send(connection):
             self._send_later(0.0)
             return
+        if not connection.room:
+            if connection.window >= LEAST_GATHERED:
+                channel.gather(GATHER)
+            return  # an acknowledgement makes room
         due = self._sender.due()
         if due is not None:
             self._send_later(due)

@@ -56,6 +56,7 @@ ENTRIES = (
     "upstream.chunk",
     "upstream.cut",
     "upstream.eof",
+    "upstream.gather",
     "upstream.look",
     "upstream.lost",
     "upstream.made",
@@ -706,6 +707,52 @@ async def test_nothing_is_received_while_reading_is_paused(site):
 
 
 @pytest.mark.parametrize("scheme", ["mqtt", "mqtts"])
+@pytest.mark.parametrize("held", [False, True], ids=["", "held"])
+async def test_what_comes_while_it_gathers_comes_at_once(site, tmp_path, scheme, held):
+    path = certify(tmp_path, "server", "localhost")
+    said = threading.Event()
+
+    def serve(connection: socket.socket) -> None:
+        if scheme == "mqtts":
+            connection = server_side(path).wrap_socket(connection, server_side=True)
+        connection.recv(1)
+        for _ in range(20):
+            connection.sendall(b"x")
+            time.sleep(0.001)
+        said.set()
+        never(connection)
+
+    with Server(serve) as server:
+        transport = await site.dial(f"{scheme}://localhost:{server.port}", UpstreamTls(ca=path))
+        owner = Owner(transport)
+        await asyncio.sleep(0.05)  # it is handed nothing before its first turn
+        transport.gather(20.0)
+        transport.write([b"?"])
+        await until(said.is_set)
+        await asyncio.sleep(0.05)
+        assert not owner.sizes
+        if held:
+            transport.pause_reading()
+        transport._gather_timer.cancel()
+        transport._gathered()
+        if held:
+            await asyncio.sleep(0.05)
+            assert not owner.sizes
+            transport.gather(20.0)
+            transport.resume_reading()
+            await asyncio.sleep(0.05)
+            assert not owner.sizes
+            transport._gather_timer.cancel()
+            transport._gathered()
+        await until(lambda: len(owner.data) == 20)
+        assert owner.sizes == [20] if scheme == "mqtt" else len(owner.sizes) <= 20
+        transport.gather(20.0)
+        transport.abort("enough")
+        await until(lambda: owner.reasons)
+        assert transport._gather_timer.cancelled()
+
+
+@pytest.mark.parametrize("scheme", ["mqtt", "mqtts"])
 async def test_little_is_unsent_while_the_broker_does_not_read(site, tmp_path, scheme):
     """In the system beyond what is in flight, and here."""
     path = certify(tmp_path, "server", "localhost")
@@ -842,6 +889,8 @@ async def test_a_fault_ends_one_connection_alone(site, escaped, monkeypatch, ent
             monkeypatch.setattr(
                 transport, "_unsent", lambda: 0 if entry in faults.by_entry else SYSTEM_UNSENT
             )
+        if entry == "upstream.gather":
+            transport.gather(0.05)
         transport.write([bytes(10_000_000)])
         if entry == "upstream.cut":
             transport.close("cut", 0.1)

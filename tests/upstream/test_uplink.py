@@ -35,6 +35,7 @@ from appliance.upstream import disk_room
 from appliance.upstream.refusals import reason_words
 from appliance.upstream.sender import WITHOUT_PROGRESS
 from appliance.upstream.status import warnings_of
+from appliance.upstream.uplink import GATHER, LEAST_GATHERED
 from upstream.fake_fleet import FakeFleet, Visit, accept, close_at, never, refuse, refuse_topic
 from upstream.hostile import SCENARIOS
 from upstream.relay import Relay
@@ -94,6 +95,38 @@ async def test_what_is_acknowledged_here_arrives_there_once_and_in_order(tmp_pat
         await until(lambda: len(payloads(fleet, "fleet/r2d2/events/door")) == 300)
         assert payloads(fleet, "fleet/r2d2/events/door") == sent
         await rig.drained()
+        assert not fleet.faults
+
+
+@pytest.mark.parametrize("window", [LEAST_GATHERED, LEAST_GATHERED - 1])
+async def test_while_a_large_window_is_full_acknowledgements_are_gathered(
+    tmp_path: Path, window: int
+) -> None:
+    """A small one is filled again at each of them: there the round trip limits the rate."""
+    async with (
+        FakeFleet(limits={Property.RECEIVE_MAXIMUM: window}) as fleet,
+        running(Rig(tmp_path, fleet.port)) as rig,
+    ):
+        await fleet.visited()
+        await rig.connected()
+        transport = rig.uplink._lines[0].channel._transport
+        gathered: list[float] = []
+        gather = transport.gather
+        transport.gather = lambda seconds: (gathered.append(seconds), gather(seconds))
+        fleet.acknowledge = never
+        sent = [b"%d" % number for number in range(window + 100)]
+        assert await publish(rig, "r2d2/events/door", *sent[:window]) == [0] * window
+        await until(lambda: len(fleet.published) == window + 1)  # and the state
+        assert bool(gathered) == (window == LEAST_GATHERED)
+        await publish(rig, "r2d2/events/door", *sent[window:])
+        assert not rig.uplink._lines[0].channel.connection.room
+        fleet.acknowledge = accept
+        for packet_id in list(fleet.visit.unacknowledged):
+            fleet.visit.acknowledge(packet_id)
+            await fleet.visit.drain()
+        await rig.drained()
+        assert payloads(fleet, "fleet/r2d2/events/door") == sent
+        assert set(gathered) <= {GATHER}
         assert not fleet.faults
 
 
