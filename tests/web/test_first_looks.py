@@ -37,6 +37,12 @@ def test_a_long_value_in_an_unfolded_tree(visit: Callable[..., Visit], screen: A
     assert re.fullmatch(r"\d+:\d\d:\d\d\.\d{3}(\s[AP]M)?", time)
     assert_fits(page)
     visited.look(f"{screen['viewport']['width']}-topics-inspected")
+    focused = "document.activeElement.id || document.activeElement.className"
+    # The phone shows either the tree or the topic, and what it shows has the focus.
+    assert page.evaluate(focused) == ("inspected" if screen is PHONE else "row")
+    page.click("a:text-is('Close')")
+    page.wait_for_selector(f"{row}:focus" if screen is PHONE else ".list")
+    assert_fits(page)
 
 
 def test_what_has_a_ring(visit: Callable[..., Visit], appliance: ApplianceProcess) -> None:

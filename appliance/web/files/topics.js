@@ -19,10 +19,28 @@ export default function Topics({ topic }) {
     return () => focus('')
   }, [topic])
   useEffect(() => () => { if (isPaused.peek()) pause(false) }, []) // other pages have no button for it
+  const before = useRef('')
+  useEffect(() => {
+    const closed = before.current
+    before.current = topic
+    // On a narrow screen the tree and the inspector take each other's place: so does the focus.
+    if (topic === closed || hasFocus()) return
+    const rows = [...document.querySelectorAll('.list a.row')]
+    const next = topic ? document.getElementById('inspected') : rows.find((row) => row.getAttribute('href') === hrefOf(closed))
+    ;(next ?? document.querySelector('main'))?.focus()
+  }, [topic])
   return html`<div class=${`topics ${topic ? 'inspecting' : ''}`}>
     <div class="list"><h1>Topics</h1><${Tree} topic=${topic} /></div>
     ${topic && html`<${Inspector} key=${topic} topic=${topic} />`}
   </div>`
+}
+
+const hrefOf = (topic) => `#/topics/${encodeURIComponent(topic)}`
+
+/** Whether something that is shown has the focus. */
+function hasFocus() {
+  const at = document.activeElement
+  return at !== null && at !== document.body && at.getClientRects().length > 0
 }
 
 const sought = signal('')
@@ -95,7 +113,7 @@ function Branch({ part, inner, path, topic, isOpen }) {
 function Row({ name, label, topic }) {
   const row = rows.get(name)?.value
   if (row === undefined) return null
-  return html`<li><a class="row" href=${`#/topics/${encodeURIComponent(name)}`}
+  return html`<li><a class="row" href=${hrefOf(name)}
       aria-current=${name === topic ? 'true' : null} title=${shown(name)}>
     <bdi class="name">${shown(label)}</bdi>
     <span class="value">${row.text}</span>
@@ -128,7 +146,7 @@ function Inspector({ topic }) {
   const message = told?.topic === topic ? told.message : null
   const keep = async () => save(await ask('export'), `${topic}.jsonl`)
   return html`<section class="inspector" aria-labelledby="inspected">
-    <div class="tools"><h2 id="inspected"><bdi>${shown(topic)}</bdi></h2>
+    <div class="tools"><h2 id="inspected" tabindex="-1"><bdi>${shown(topic)}</bdi></h2>
       <a class="button" href=${`#/publish/${encodeURIComponent(topic)}`}>Publish</a>
       <a class="button" href="#/topics">Close</a></div>
     ${told?.reason && html`<p class="notice bad" role="alert">${told.reason}</p>`}
