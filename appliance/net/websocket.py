@@ -163,7 +163,7 @@ class WebSocketLayer(MiddleLayer):
                 is_text = True
                 break
             if frame.opcode is Opcode.BINARY or frame.opcode is Opcode.CONT:
-                payload.append(cast(bytes, frame.data))
+                payload.append(bytes(frame.data))  # unmasked ones are bytearrays
         if payload:  # [MQTT-6.0.0-2]
             self._protocol.data_received(payload[0] if len(payload) == 1 else b"".join(payload))
         self._answer(frames.data_to_send())

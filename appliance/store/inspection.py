@@ -328,6 +328,7 @@ def _changing(path: Path) -> Iterator[tuple[Rows, Batch]]:
         for key in rows.message.keys() - used:
             batch.remove(Table.MESSAGE, key)
         with contextlib.closing(connect(path)) as connection:
+            connection.execute("PRAGMA secure_delete = ON")  # gone, even if VACUUM has no room
             write(connection, batch)
             # VACUUM needs as much disk again for a moment; without that the file stays large.
             with contextlib.suppress(sqlite3.Error):

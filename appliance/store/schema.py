@@ -192,8 +192,9 @@ def connect(path: Path, durability: Durability = "power") -> sqlite3.Connection:
         connection.execute(f"PRAGMA synchronous = {_SYNCHRONOUS[durability]}")
         connection.execute(f"PRAGMA wal_autocheckpoint = {CHECKPOINT_PAGES}")
         connection.execute("PRAGMA temp_store = MEMORY")
-        # Debian's SQLite fills what is deleted with zeros, and so writes it once more. With FAST it
-        # does that only where a page is written anyway.
+        # Debian's SQLite is built to write zeros over all that is deleted, also in pages that it
+        # would not write otherwise. With FAST it leaves those: what was there may stay in the file
+        # until they are used again.
         connection.execute("PRAGMA secure_delete = FAST")
         _migrate(connection, path)
     except BaseException:

@@ -50,8 +50,8 @@ class Record:
     expires_at: float | None
     properties_wire: bytes
 
-    # Not the dataclass's own, which is interpreted in the compiled build, too: it took a tenth of
-    # the time in which a backlog drains.
+    # Not the dataclass's own, which stays interpreted in the compiled build: it took a tenth of the
+    # time in which a backlog drains.
     def __init__(
         self,
         number: int,

@@ -170,7 +170,7 @@ class Sender:
                 except BaseException:
                     self._backlog.put_back(entries[place + 1 :])
                     raise
-        return True
+        return connection.room > 0
 
     def due(self) -> float | None:
         """Seconds until there may be something to send; None if that is unknown."""

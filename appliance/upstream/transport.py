@@ -213,6 +213,8 @@ class UpstreamTransport:
     @contained("upstream.chunk")
     def data_received(self, data: bytes) -> None:
         """Hand the chunk on, now or in turns."""
+        if not data:  # an empty WebSocket frame
+            return
         is_small = len(data) <= PORTION
         waits = self._backlog or self._queued or self._held or self._owner is None
         if is_small and not waits and not self._scheduler.must_wait(self, is_small=True):
@@ -292,8 +294,13 @@ class UpstreamTransport:
 
     def gather(self, seconds: float) -> None:
         """Receive nothing for so long: what comes meanwhile is then received at once, for the cost
-        of one round of the event loop."""
-        if self._gather_timer is None and self._transport is not None and not self._is_closing:
+        of one round of the event loop.
+
+        Not while TLS or WebSocket have more to hand on, which would wait as well.
+        """
+        if self._gather_timer is not None or self._transport is None or self._is_closing:
+            return
+        if not self._transport.get_extra_info("has_unread"):
             self._gather_timer = self._entries.later(
                 "upstream.gather", seconds, self._gathered, served=self, failed=self.abort
             )

@@ -58,9 +58,12 @@ CLOCK_STEP: Final = 0.001
 #: Seconds for which the fleet's broker is asked to keep the session of rules with `offline: keep`.
 KEPT_EXPIRY: Final = 7 * 86400
 
-#: Seconds for which acknowledgements are gathered while the window is full, if it is so large that
-#: thousands come in a second. Read one by one they would cost a round of the event loop each.
+#: Seconds for which acknowledgements are gathered while the window is full: read one by one they
+#: would cost a round of the event loop each. Commands on the same connection come as much later.
 GATHER: Final = 0.002
+
+#: Windows that are smaller are filled again at each acknowledgement: with these and a short round
+#: trip two milliseconds would count.
 LEAST_GATHERED: Final = 256
 
 #: What CONNECT announces. Explicitly, because mosquitto otherwise has no more than 20 messages in
@@ -247,6 +250,7 @@ class Uplink:
     def send_more(self, channel: Channel) -> None:
         """See `ChannelOwner`."""
         connection = channel.connection
+        # Without room an acknowledgement is what it waits for, and not the network.
         if channel is not self._lines[0].channel or not connection.room or not channel.can_send:
             return
         self._state.send(channel)
@@ -440,7 +444,7 @@ class Uplink:
             status.since = round(self._loop.time() - channel.connected_at, 1)
             if connection.round_trip is not None:
                 status.round_trip = max(connection.round_trip, CLOCK_STEP)
-            status.window = connection.room + connection.inflight
+            status.window = connection.window
             status.inflight = connection.inflight
         status.waiting, status.waiting_bytes = counts.waiting, counts.bytes
         if counts.oldest_at is not None:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import shutil
+import sqlite3
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from raw_client import RawClient
 
 from appliance.cli import main as cli
 from appliance.mqtt.packets import Puback, Publish, Subscribe, Subscription
+from appliance.store import inspection, schema
 
 
 @pytest.fixture
@@ -98,6 +100,38 @@ def test_it_is_pruned_when_the_appliance_is_stopped(process: ApplianceProcess) -
     with RawClient(process, 4) as client:
         assert client.connect("second", clean=False)[2] == 1
         assert len([packet for packet in client.drain() if isinstance(packet, Publish)]) == 2
+
+
+class WithoutRoom:
+    """A connection to a database on a disk that has no room for VACUUM."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._connection, name)
+
+    def execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        if statement == "VACUUM":
+            raise sqlite3.OperationalError("database or disk is full")
+        return self._connection.execute(statement, *values)
+
+
+def test_what_is_pruned_is_gone_also_on_a_full_disk(
+    process: ApplianceProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with RawClient(process, 4) as client:
+        client.connect("publisher")
+        client.send(Publish("r2d2/a", b"confidential" * 5000, 1, packet_id=1))
+        assert isinstance(client.decode(client.receive()), Puback)
+    process.stop()
+    database = process.directory / "state/store.db"
+    assert b"confidential" in database.read_bytes()
+    monkeypatch.setattr(inspection, "connect", lambda path: WithoutRoom(schema.connect(path)))
+    for name in ("first", "second"):
+        assert store(process, "prune", "--client", name).returncode == 0
+    for path in database.parent.glob("store.db*"):
+        assert b"confidential" not in path.read_bytes()
 
 
 def test_what_is_pruned_is_in_no_figure_any_more(process: ApplianceProcess) -> None:

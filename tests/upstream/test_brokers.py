@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from appliance_process import free_ports
 from harness import Peer
 from waiting import until
 
@@ -268,6 +269,14 @@ async def test_a_cluster_of_rabbitmq_whose_first_node_is_killed(
             await until(lambda: not set(range(1, sent + 1)) - set(arrived()), "all of them")
             numbers = arrived()
             assert list(dict.fromkeys(numbers)) == sorted(set(numbers))
+
+
+async def test_mosquitto_over_websocket(tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    options = f"max_queued_messages 0\nlistener {port} {HOST}\nprotocol websockets"
+    with FleetMosquitto(tmp_path / "mosquitto", options=options) as fleet:
+        rig = link(tmp_path, servers=[f"ws://{HOST}:{port}/mqtt"])
+        await carries_both_ways(rig, fleet.plain_port, V5)
 
 
 async def test_mosquitto_twice_and_another_client_with_the_client_id(

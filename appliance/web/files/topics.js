@@ -19,14 +19,14 @@ export default function Topics({ topic }) {
     return () => focus('')
   }, [topic])
   useEffect(() => () => { if (isPaused.peek()) pause(false) }, []) // other pages have no button for it
-  const before = useRef('')
+  const before = useRef(topic)
   useEffect(() => {
     const closed = before.current
     before.current = topic
     // On a narrow screen the tree and the inspector take each other's place: so does the focus.
     if (topic === closed || hasFocus()) return
-    const rows = [...document.querySelectorAll('.list a.row')]
-    const next = topic ? document.getElementById('inspected') : rows.find((row) => row.getAttribute('href') === hrefOf(closed))
+    const links = [...document.querySelectorAll('.list a.row')]
+    const next = topic ? document.getElementById('inspected') : links.find((link) => link.getAttribute('href') === hrefOf(closed))
     ;(next ?? document.querySelector('main'))?.focus()
   }, [topic])
   return html`<div class=${`topics ${topic ? 'inspecting' : ''}`}>
@@ -37,10 +37,10 @@ export default function Topics({ topic }) {
 
 const hrefOf = (topic) => `#/topics/${encodeURIComponent(topic)}`
 
-/** Whether something that is shown has the focus. */
+/** Whether something that is shown has the focus. The page as a whole has it in Safari, where a click gives a link none. */
 function hasFocus() {
   const at = document.activeElement
-  return at !== null && at !== document.body && at.getClientRects().length > 0
+  return at !== null && at !== document.body && at.localName !== 'main' && at.getClientRects().length > 0
 }
 
 const sought = signal('')
