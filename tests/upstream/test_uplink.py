@@ -108,11 +108,16 @@ async def test_while_a_large_window_is_full_acknowledgements_are_gathered(
         running(Rig(tmp_path, fleet.port)) as rig,
     ):
         await fleet.visited()
-        await rig.connected()
+        await until(lambda: fleet.published and not rig.status().inflight, "the state to be there")
         transport = rig.uplink._lines[0].channel._transport
         gathered: list[float] = []
         gather = transport.gather
-        transport.gather = lambda seconds: (gathered.append(seconds), gather(seconds))
+
+        def noting(seconds: float) -> None:
+            gathered.append(seconds)
+            gather(seconds)
+
+        transport.gather = noting
         fleet.acknowledge = never
         sent = [b"%d" % number for number in range(window + 100)]
         assert await publish(rig, "r2d2/events/door", *sent[:window]) == [0] * window
