@@ -650,16 +650,15 @@ async def test_what_websocket_has_received_does_not_wait_for_a_gathering(site):
 
     class Gathering(Owner):
         def received(self, data: bytes) -> bool:
-            transport.gather(0.3)
+            transport.gather(60.0)  # longer than anything waits here
             return super().received(data)
 
     with Server(serve) as server:
         transport = await site.dial(f"ws://127.0.0.1:{server.port}")
         owner = Gathering(transport)
         transport.write([b"?"])
-        began = asyncio.get_running_loop().time()
         await until(lambda: len(owner.data) == 20_000)
-        assert asyncio.get_running_loop().time() - began < 5 * 0.3  # ten portions, or more
+        assert len(owner.sizes) > 1
         transport.abort()
         await until(lambda: owner.reasons)
 
