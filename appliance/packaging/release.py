@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from appliance.packaging import wheels
+from appliance.packaging import emulation, root, wheels
 
 PROJECT = Path(__file__).resolve().parents[2]
 WORK = PROJECT / "build/release"
@@ -66,10 +66,11 @@ class Release:
                     self._say(wheel.name)
                     if machine == native:
                         self._try(wheel, python.executable, f"appliance {version}, compiled")
-        with self._step("one file and Debian package"):
-            packages = self._one_file(version)
-        with self._step("bill of materials of the one file (CycloneDX)"):
-            self._bill(version, packages)
+        for machine in machines:
+            with self._step(f"one file and Debian package for {machine}"):
+                self._one_file(version, machine)
+            with self._step("bill of materials of the one file (CycloneDX)"):
+                self._bill(version, machine)
         with self._step("checks"):
             self._check()
         with self._step(CHECKSUMS):
@@ -119,53 +120,47 @@ class Release:
         self._run(*pip, "-q", "-c", constraints, wheel, cwd=house)
         self._use(house / "venv/bin/appliance", house, version)
 
-    def _use(self, command: Path, house: Path, version: str) -> None:
-        told = self._run(command, "--version", cwd=house).strip()
+    def _use(
+        self, command: Path, house: Path, version: str, within: Sequence[str | Path] = ()
+    ) -> None:
+        """Run the command of what was built, in a folder of its own; by another command."""
+        told = self._run(*within, command, "--version", cwd=house).strip()
         if told != version:
             raise ReleaseError(f"{command} says that it is {told!r}, which ought to be {version!r}")
-        self._run(command, "init", "--robot", "r2d2", cwd=house)
-        check = self._run(command, "check", cwd=house)
+        self._run(*within, command, "init", "--robot", "r2d2", cwd=house)
+        check = self._run(*within, command, "check", cwd=house)
         self._say(f"{told}; init; check: {check.strip().splitlines()[-1]}")
 
-    def _one_file(self, version: str) -> Path:
-        """Build both, and return the folder with the packages that the one file is made of."""
-        made = self._work / "one-file"
-        made.mkdir()
-        if (self._source / "appliance/packaging/root.py").exists():
-            # In an old Debian's root, for old systems. Its Python is kept for the next release.
-            cache = PROJECT / "build/oldest"
-            module = (sys.executable, "-m", "appliance.packaging.root", "--out", made)
-            self._run(*module, "--cache", cache, cwd=self._source)
-            environment = cache / "venv"
-        else:
-            self._say("for systems with this one's glibc or a later one")
-            self._run("make", "binary", "deb", f"PYTHON={sys.executable}", cwd=self._source)
-            for file in ("appliance", *(each.name for each in self._source.glob("dist/*.deb"))):
-                shutil.copy2(self._source / "dist" / file, made)
-            environment = self._source / ".venv"
-        command = self.out / f"appliance-{version}-linux-{os.uname().machine}"
-        shutil.move(made / "appliance", command)
-        (package,) = made.glob("*.deb")
-        shutil.move(package, self.out)
-        house = self._work / "try-one-file"
+    def _one_file(self, version: str, machine: str) -> None:
+        """Build both in an old Debian's root, for old systems, and use the one file there."""
+        made = self._work / f"one-file-{machine}"
+        # The root and its Python are kept for the next release.
+        cache = root.default_cache(machine)
+        options = ("--machine", machine, "--cache", cache, "--out", made)
+        self._run(sys.executable, "-m", "appliance.packaging.root", *options, cwd=self._source)
+        house = self._work / f"try-one-file-{machine}"
         house.mkdir()
-        told = self._run(command, "--version", cwd=house).strip()
-        self._use(command, house, told)
-        if not told.startswith(f"appliance {version}"):
-            raise ReleaseError(f"the one file says that it is {told!r}, which is not {version}")
-        self._run("dpkg-deb", "--info", self.out / package.name, cwd=house)
-        return environment
+        command = Path(shutil.copy2(made / "appliance", house))
+        # It sees that folder and the root, which has neither our Python nor our libraries.
+        bind = ("--bind", house, house, "--chdir", house)
+        within = (*root.sandbox(cache / "root", machine), *bind)
+        self._use(command, house, f"appliance {version}, compiled", within)
+        (package,) = made.glob("*.deb")
+        self._run("dpkg-deb", "--info", package, cwd=made)
+        shutil.move(made / "appliance", self.out / f"appliance-{version}-linux-{machine}")
+        shutil.move(package, self.out)
 
-    def _bill(self, version: str, environment: Path) -> None:
-        """Of the packages in that environment, whichever system its Python is of."""
+    def _bill(self, version: str, machine: str) -> None:
+        """Of the packages in the environment of the build, whichever computer its Python is of."""
+        environment = root.default_cache(machine) / "venv"
         found = sorted(environment.glob("lib/python3*/site-packages"))
         if not found:
             raise ReleaseError(f"{environment} is no environment of Python: see {self._log}")
-        reader = self._work / "bill"
+        reader = self._work / f"bill-{machine}"
         venv.create(reader, with_pip=False)
         (site,) = reader.glob("lib/python3*/site-packages")
         (site / "packages.pth").write_text(f"{found[0]}\n")
-        bill = self.out / f"appliance-{version}-linux-{os.uname().machine}.cdx.json"
+        bill = self.out / f"appliance-{version}-linux-{machine}.cdx.json"
         options: list[str | Path] = ["--output-reproducible", "--mc-type", "application"]
         options += ["--of", "JSON", "-o", bill, "--pyproject", self._source / "pyproject.toml"]
         tool = (sys.executable, "-m", "cyclonedx_py", "environment")
@@ -181,8 +176,8 @@ class Release:
         settings = ("--config", self._source / "pyproject.toml")
         these = self.out.glob("*.whl")
         self._checked(*module, "check_wheel_contents", *settings, *these)
-        root = ("--allow-root",) if os.geteuid() == 0 else ()
-        lintian = ("lintian", *root, "--fail-on", "error,warning")
+        as_root = ("--allow-root",) if os.geteuid() == 0 else ()
+        lintian = ("lintian", *as_root, "--fail-on", "error,warning")
         self._checked(*lintian, *self.out.glob("*.deb"))
 
     def _checked(self, *command: str | Path) -> None:
@@ -261,7 +256,7 @@ def main() -> int:
         "--machine",
         action="append",
         default=[],
-        choices=("x86_64", "aarch64"),
+        choices=sorted(emulation.ARCHITECTURES),
         help="and a kind of computer; default: this one, and others that there is a compiler for",
     )
     options = parser.parse_args()
@@ -283,6 +278,7 @@ def main() -> int:
                     f"there is no compiler for {machine} here: for aarch64 on another computer, "
                     "apt install gcc-aarch64-linux-gnu"
                 )
+            root.check_computer(machine)
         pythons = [wheels.Python.at(each) for each in options.python] or wheels.pythons_here()
         if not pythons:
             raise ReleaseError("no Python here has its headers: apt install python3-dev")
@@ -294,7 +290,7 @@ def main() -> int:
         out.mkdir(parents=True, exist_ok=True)
         for path in release.out.iterdir():  # only now: there are all of them, or none
             shutil.move(path, out)
-    except (ReleaseError, wheels.WheelError) as error:
+    except (ReleaseError, wheels.WheelError, root.BuildError) as error:
         print(f"release: {error}", file=sys.stderr)
         return 1
     return 0

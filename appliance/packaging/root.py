@@ -4,6 +4,9 @@ A program runs with the glibc that it was linked with, and with later ones. So t
 root of Debian 11, with a Python that is built there from a later Debian's sources, and the broker
 as machine code. apt verifies what comes from Debian, by its signatures, and pip what comes from
 PyPI. The build itself has no network.
+
+For another kind of computer everything is the same: its programs, Python among them, are emulated,
+and the compiler, which is of this computer's kind, makes code for the other.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from appliance.packaging import symbols
+from appliance.packaging import emulation, symbols
 
 PROJECT = Path(__file__).resolve().parents[2]
 PYTHON_RECIPE = Path(__file__).with_name("python.sh")
@@ -35,12 +38,18 @@ SOURCE_SUITES = ("bookworm", "trixie")
 #: What Debian 11 has too old, or without updates: the newest of it in those suites is built.
 SOURCES = ("openssl", "sqlite3", "python3.11")
 PYTHON = "/usr/local/bin/python3.11"
+SYSTEM_PATH = ("/usr/sbin", "/usr/bin", "/sbin", "/bin")
 
 #: In the root: the tools, and the libraries that Python's modules are linked with.
-PACKAGES = (
-    *("build-essential", "ca-certificates", "pkg-config", "quilt", "tcl", "xz-utils"),
-    *("libbz2-dev", "libexpat1-dev", "libffi-dev", "liblzma-dev", "uuid-dev", "zlib1g-dev"),
-)
+TOOL_PACKAGES = ("build-essential", "ca-certificates", "pkg-config", "quilt", "tcl", "xz-utils")
+LIBRARIES = ("libbz2-dev", "libexpat1-dev", "libffi-dev", "liblzma-dev", "uuid-dev", "zlib1g-dev")
+#: The compiler and its tools for another kind of computer, under their usual names.
+CROSS_TOOLS = Path("/opt/cross")
+#: `ldd` of the root knows the loader of its own kind only.
+LDD = """\
+#!/bin/sh
+exec /lib/ld-linux-{machine}.so.1 --list "$@"
+"""
 #: The commands that this needs, and the packages of Debian which have them.
 TOOLS = {
     "mmdebstrap": "mmdebstrap",
@@ -94,10 +103,12 @@ def _mounts(table: str = "/proc/self/mountinfo") -> Iterator[Path]:
 class Root:
     """The root and what goes with it, in a folder that is kept between builds."""
 
-    def __init__(self, cache: Path, mirror: str, optimized: bool) -> None:
+    def __init__(self, cache: Path, mirror: str, optimized: bool, machine: str) -> None:
         self._cache = cache
         self._mirror = mirror
         self._optimized = optimized
+        self._machine = machine
+        self._foreign = emulation.is_foreign(machine)
         self._root = cache / "root"
         self._local = cache / "local"
         self._sources = cache / "sources"
@@ -109,7 +120,7 @@ class Root:
         """Make what is missing, and then the one file and its deb. Returns the paths of both."""
         self._say("fetch the sources of Python and its libraries")
         versions = self._fetch_sources()
-        of_debian = [SUITE, self._mirror, *PACKAGES]
+        of_debian = [SUITE, self._mirror, self._machine, *self._packages()]
         of_python = [*of_debian, *versions, f"{self._optimized}", PYTHON_RECIPE.read_text()]
         self._make(self._root, of_debian, self._make_root)
         self._make(self._local, of_python, self._make_python)
@@ -166,23 +177,53 @@ class Root:
             self._say(f"{name} {version} could not be fetched; trying the version before")
         raise BuildError(f"no source of {name} could be fetched from {self._mirror}: see above")
 
+    def _packages(self) -> list[str]:
+        if not self._foreign:
+            return [*TOOL_PACKAGES, *LIBRARIES]
+        other = emulation.ARCHITECTURES[self._machine]
+        compiler = f"gcc-{self._machine}-linux-gnu"
+        return [*TOOL_PACKAGES, compiler, *(f"{each}:{other}" for each in LIBRARIES)]
+
     def _make_root(self) -> None:
         self._say(f"make the root of Debian's {SUITE}")
+        kinds = dict.fromkeys((os.uname().machine, self._machine))
+        architectures = ",".join(emulation.ARCHITECTURES[each] for each in kinds)
+        suite = f"deb {self._mirror} {SUITE} main"
         security = f"deb {self._mirror}-security {SUITE}-security main"
-        # What it mounts is in a namespace of its own, and gone with it also if it is killed.
-        _run(
+        make = (
+            # What it mounts is in a namespace of its own, and gone with it also if it is killed.
             *("unshare", "--mount", "--propagation", "private", "--pid", "--fork"),
             *("mmdebstrap", "--quiet", "--variant=minbase", f"--keyring={KEYRING}"),
+            f"--architectures={architectures}",
             *('--aptopt=Acquire::Languages "none"', '--aptopt=APT::Install-Recommends "false"'),
-            *(f"--include={','.join(PACKAGES)}", SUITE, self._root),
-            *(f"deb {self._mirror} {SUITE} main", security),
+            *(f"--include={','.join(self._packages())}", SUITE, self._root),
         )
+        try:
+            _run(*make, suite, security)
+        except BuildError:  # a mirror can list what it does not have
+            self._say("trying without security updates, which could not be fetched: see above")
+            remove(self._root)
+            _run(*make, suite)
         for file in NETWORK_FILES:  # it is read-only when these are mounted there
             place = self._root / file.relative_to("/")
             if not place.exists():
                 place.touch()
+        if self._foreign:
+            self._make_cross_tools()
+
+    def _make_cross_tools(self) -> None:
+        tools = self._root / CROSS_TOOLS.relative_to("/")
+        tools.mkdir(parents=True)
+        start = f"{self._machine}-linux-gnu-"
+        for tool in (self._root / "usr/bin").glob(f"{start}*"):
+            (tools / tool.name.removeprefix(start)).symlink_to(f"/usr/bin/{tool.name}")
+        (tools / "cc").symlink_to("gcc")
+        (tools / "ldd").write_text(LDD.format(machine=self._machine))
+        (tools / "ldd").chmod(0o755)
 
     def _make_python(self) -> None:
+        if self._foreign:
+            self._check_emulation()
         self._say("build Python and its libraries there")
         compiled = self._cache / "compile"
         remove(compiled)
@@ -198,6 +239,15 @@ class Root:
         if done.returncode:
             raise BuildError(f"Python could not be built; the reason is at the end of {log.name}")
         remove(compiled)
+
+    def _check_emulation(self) -> None:
+        try:
+            _run(*self._inside([], ["ldd", f"/lib/{self._machine}-linux-gnu/libc.so.6"]))
+        except BuildError:
+            raise BuildError(
+                f"programs for {self._machine} do not run here: that takes Linux 6.7 or later, or "
+                "qemu as their interpreter for all users (binfmt_misc)"
+            ) from None
 
     def _copy_project(self) -> Path:
         """The files of the project, without what is ignored by git."""
@@ -265,15 +315,16 @@ class Root:
     def _inside(
         self, binds: Sequence[str | Path], command: Sequence[str], network: bool = False
     ) -> list[str | Path]:
-        """A command for this in the root. Its mounts are seen by nobody else and end with it."""
+        """A command for this in the root, with the Python of it and the tools."""
+        tools = [f"{CROSS_TOOLS}"] if self._foreign else []
+        path = [*tools, "/usr/local/bin", *SYSTEM_PATH]
         return [
-            *("bwrap", "--ro-bind", self._root, "/", "--ro-bind", self._local, "/usr/local"),
-            *("--dev", "/dev", "--proc", "/proc", "--tmpfs", "/tmp", "--tmpfs", "/mnt"),
-            *("--unshare-pid", "--unshare-ipc", "--die-with-parent"),
+            *sandbox(self._root, self._machine),
+            *("--ro-bind", self._local, "/usr/local", "--tmpfs", "/mnt"),
             *(() if network else ("--unshare-net",)),
-            "--clearenv",
-            *("--setenv", "PATH", "/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"),
-            *("--setenv", "LC_ALL", "C.UTF-8", "--setenv", "HOME", "/tmp"),
+            *("--setenv", "PATH", ":".join(path)),
+            *("--setenv", "MACHINE", self._machine),
+            *("--setenv", "DEB_HOST_ARCH", emulation.ARCHITECTURES[self._machine]),
             *("--setenv", "LD_LIBRARY_PATH", "/usr/local/lib"),
             *binds,
             *command,
@@ -281,6 +332,25 @@ class Root:
 
     def _say(self, what: str) -> None:
         print(f"{SUITE}: {what}", file=sys.stderr, flush=True)
+
+
+def sandbox(root: Path, machine: str) -> list[str | Path]:
+    """What to put before a command, and before more options of bwrap, to run it in that root.
+
+    The root is read-only, and has an empty /tmp. Mounts are seen by nobody else and end with it.
+    """
+    return [
+        *emulation.prefix(machine),
+        *("bwrap", "--ro-bind", root, "/", "--dev", "/dev", "--proc", "/proc", "--tmpfs", "/tmp"),
+        *("--unshare-pid", "--unshare-ipc", "--die-with-parent", "--clearenv"),
+        *("--setenv", "PATH", ":".join(SYSTEM_PATH)),
+        *("--setenv", "LC_ALL", "C.UTF-8", "--setenv", "HOME", "/tmp"),
+    ]
+
+
+def default_cache(machine: str) -> Path:
+    """Where the root for that kind of computer is kept."""
+    return PROJECT / f"build/oldest-{machine}"
 
 
 def _order(one: str, other: str) -> int:
@@ -316,13 +386,14 @@ def _alone(cache: Path) -> Iterator[None]:
         yield
 
 
-def check_computer() -> None:
-    """Raises BuildError if this computer lacks what the build needs."""
-    missing = sorted({package for tool, package in TOOLS.items() if not shutil.which(tool)})
+def check_computer(machine: str) -> None:
+    """Raises BuildError if this computer lacks what a build for that kind of computer needs."""
+    missing = {package for tool, package in TOOLS.items() if not shutil.which(tool)}
+    missing.update(emulation.missing(machine))
     if not KEYRING.exists():
-        missing.append("debian-archive-keyring")
+        missing.add("debian-archive-keyring")
     if missing:
-        raise BuildError(f"install what this needs: apt install {' '.join(missing)}")
+        raise BuildError(f"install what this needs: apt install {' '.join(sorted(missing))}")
     if os.geteuid():
         raise BuildError("only root can make the root file system of another Debian: use sudo")
 
@@ -331,10 +402,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=PROJECT / "dist", help="default: dist")
     parser.add_argument(
+        "--machine",
+        choices=sorted(emulation.ARCHITECTURES),
+        default=os.uname().machine,
+        help="the kind of computer; default: this one; another is emulated",
+    )
+    parser.add_argument(
         "--cache",
         type=Path,
-        default=PROJECT / "build/oldest",
-        help="where the root is kept for the next build; 2 GB; default: build/oldest",
+        help="where the root is kept for the next build; 2 GB; default: build/oldest-MACHINE",
     )
     parser.add_argument("--mirror", default=MIRROR, help=f"Debian's packages; default: {MIRROR}")
     parser.add_argument(
@@ -345,9 +421,11 @@ def main() -> int:
     options = parser.parse_args()
     os.umask(0o022)
     try:
-        check_computer()
-        with _alone(options.cache):
-            root = Root(options.cache.absolute(), options.mirror.rstrip("/"), options.optimized)
+        check_computer(options.machine)
+        cache = (options.cache or default_cache(options.machine)).absolute()
+        with _alone(cache):
+            mirror = options.mirror.rstrip("/")
+            root = Root(cache, mirror, options.optimized, options.machine)
             print(*root.build(options.out), sep="\n")
     except (BuildError, OSError, symbols.UnreadableError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import statistics
 import subprocess
@@ -22,11 +23,13 @@ import paho.mqtt.client as paho
 import psutil
 import pytest
 from appliance_process import HOST, ROBOT
-from arm64.emulated import QEMU, ROS1, SUITE, Emulated
+from arm64.emulated import PYTHON, QEMU, ROS1, SUITE, Emulated
 from debian_root import debian_root, require
 from installed_appliance import START, InstalledAppliance, messages, next_line, subscribed
 from pages import PROJECT
 from waiting import PATIENCE, eventually
+
+from appliance.packaging import emulation
 
 MIB = 1 << 20
 VERSIONS = {"3.1.1": "311", "5.0": "5"}
@@ -97,6 +100,30 @@ def test_everything_compiled_is_for_arm64(arm64: Emulated) -> None:
     for library in libraries:
         assert Path(library).is_relative_to(arm64.root)
         assert Path(library).read_bytes()[18:20] == b"\xb7\0"  # e_machine of ELF: AArch64
+
+
+def test_programs_that_start_others(arm64: Emulated) -> None:
+    """What builds the one file for arm64 here: Linux itself calls qemu, for each program."""
+    linux = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
+    if linux < (6, 7):
+        pytest.skip("needs Linux 6.7, which has rules for each user namespace (binfmt_misc)")
+    before = rules()
+    ask = "import platform; print(platform.machine())"
+    start = f"import subprocess, sys; {ask}; subprocess.run([sys.executable, '-c', {ask!r}])"
+    done = subprocess.run(
+        [*emulation.prefix("aarch64"), arm64.root / f"usr/bin/python{PYTHON}", "-uc", start],
+        env={**os.environ, **arm64.environment, "QEMU_LD_PREFIX": str(arm64.root)},
+        capture_output=True,
+        text=True,
+        timeout=START,
+    )
+    assert done.stdout == "aarch64\naarch64\n", done.stderr
+    assert rules() == before, "the rest of the computer is as it was"
+
+
+def rules() -> set[str]:
+    """Whom Linux calls for programs of other kinds."""
+    return {each.name for each in Path("/proc/sys/fs/binfmt_misc").glob("*")}
 
 
 @pytest.mark.parametrize("qos", ["0", "1", "2"])

@@ -96,6 +96,20 @@ def test_the_compiled_broker_passes_the_tests_of_the_broker(compiled: Path):
     assert passed and int(passed[1]) > 1000, run.stdout[-1000:]
 
 
+def test_a_folder_without_machine_code_is_named(tmp_path: Path):
+    """A relative one is meant from here, and not from the folder of PyInstaller's recipe."""
+    options = ["--distpath", tmp_path / "dist", "--workpath", tmp_path / "build"]
+    recipe = ROOT / "appliance/packaging/appliance.spec"
+    done = subprocess.run(
+        [sys.executable, "-m", "PyInstaller", *options, recipe, "--", "--compiled", "none"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode
+    assert f"there is no machine code in {tmp_path}/none: " in done.stderr
+
+
 def test_the_one_file_has_the_pure_modules_behind_the_compiled(compiled: Path, tmp_path: Path):
     def where(unpacked: Path, **environment: str) -> tuple[str, str]:
         done = subprocess.run(

@@ -14,8 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from appliance.packaging import root
+from appliance.packaging import emulation, root
 from appliance.packaging.root import BuildError, Root, remove
+
+HERE = os.uname().machine
+OTHER = "aarch64" if HERE == "x86_64" else "x86_64"
 
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount: run it as root")
 
@@ -32,6 +35,10 @@ except BuildError as error:
     print(error)
 print(Path(sys.argv[1], "precious").exists())
 """
+
+
+def fails(*command: str | Path) -> None:
+    raise BuildError(f"{command[0]} failed with 1; see above")
 
 
 def told(*options: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -76,7 +83,7 @@ def test_a_link_is_not_removed(tmp_path: Path) -> None:
 
 
 def test_what_is_made_is_kept_until_it_is_made_of_something_else(tmp_path: Path) -> None:
-    kept, made = Root(tmp_path, root.MIRROR, False), tmp_path / "made"
+    kept, made = Root(tmp_path, root.MIRROR, False, HERE), tmp_path / "made"
     runs: list[str] = []
 
     def make() -> None:
@@ -118,7 +125,7 @@ def mirror(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Roo
             (commands / name).chmod(0o755)
         monkeypatch.setenv("PATH", f"{commands}:{os.environ['PATH']}")
         (tmp_path / "cache").mkdir()
-        return Root(tmp_path / "cache", root.MIRROR, False)
+        return Root(tmp_path / "cache", root.MIRROR, False, HERE)
 
     return make
 
@@ -140,7 +147,7 @@ def test_a_mirror_without_the_sources(mirror: Callable[..., Root]) -> None:
 @pytest.mark.skipif(not root.KEYRING.exists(), reason="apt install debian-archive-keyring")
 def test_a_mirror_that_cannot_be_reached(tmp_path: Path) -> None:
     with pytest.raises(BuildError, match="apt-get failed with 100"):
-        Root(tmp_path, "http://127.0.0.1:9/debian", False)._fetch_sources()
+        Root(tmp_path, "http://127.0.0.1:9/debian", False, HERE)._fetch_sources()
 
 
 @pytest.mark.skipif(not root.KEYRING.exists(), reason="apt install debian-archive-keyring")
@@ -152,7 +159,7 @@ def test_a_mirror_that_nobody_has_signed(tmp_path: Path, capfd: pytest.CaptureFi
             (folder / "main/source/Sources").write_text("Package: openssl\nVersion: 9\n")
             (folder / "Release").write_text(f"Suite: {suite}\nCodename: {suite}\n")
     with pytest.raises(BuildError, match="apt-get failed with 100"):
-        Root(tmp_path, f"file://{tmp_path}/debian", False)._fetch_sources()
+        Root(tmp_path, f"file://{tmp_path}/debian", False, HERE)._fetch_sources()
     assert "is not signed" in capfd.readouterr().err
 
 
@@ -168,7 +175,63 @@ def test_somebody_who_is_not_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(root, "KEYRING", Path(__file__))
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(BuildError, match="use sudo"):
-        root.check_computer()
+        root.check_computer(HERE)
+
+
+def test_a_computer_that_emulates_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(emulation, "RULES", tmp_path)
+    with pytest.raises(BuildError, match=r"apt install.* qemu-user-static"):
+        root.check_computer(OTHER)
+    assert emulation.missing(HERE) == []
+
+
+def test_programs_of_another_kind_that_do_not_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """An old Linux without qemu as the interpreter: the root is there, and nothing of it runs."""
+    other = Root(tmp_path, root.MIRROR, False, OTHER)
+    monkeypatch.setattr(root, "_run", fails)
+    with pytest.raises(BuildError, match=f"programs for {OTHER} do not run here: that takes Linux"):
+        other._make_python()
+
+
+def test_a_root_without_the_security_updates_is_made_again_and_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a mirror that lists them and does not have them."""
+    made: list[tuple[str, ...]] = []
+
+    def run(*command: str | Path) -> None:
+        assert not (tmp_path / "root").exists()
+        (tmp_path / "root/etc").mkdir(parents=True)
+        (tmp_path / "root/etc/ssl").mkdir()
+        made.append(tuple(map(str, command)))
+        if any("security" in each for each in made[-1]):
+            raise BuildError("mmdebstrap failed with 25")
+
+    monkeypatch.setattr(root, "_run", run)
+    Root(tmp_path, root.MIRROR, False, HERE)._make_root()
+    assert len(made) == 2 and made[1] == made[0][:-1]
+    assert "without security updates, which could not be fetched" in capsys.readouterr().err
+
+
+def test_the_tools_for_another_kind_have_their_usual_names(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made = tmp_path / "root"
+    (made / "usr/bin").mkdir(parents=True)
+    for name in (f"{OTHER}-linux-gnu-gcc", f"{OTHER}-linux-gnu-strip", "gcc"):
+        (made / "usr/bin" / name).touch()
+    other = Root(tmp_path, root.MIRROR, False, OTHER)
+    other._make_cross_tools()
+    tools = {each.name: each for each in (made / "opt/cross").iterdir()}
+    assert sorted(tools) == ["cc", "gcc", "ldd", "strip"]
+    assert tools["gcc"].readlink() == Path(f"/usr/bin/{OTHER}-linux-gnu-gcc")
+    assert f"/lib/ld-linux-{OTHER}.so.1 --list" in tools["ldd"].read_text()
+    command = [*map(str, other._inside([], ["gcc"]))]
+    path = command[len(command) - command[::-1].index("PATH")]
+    assert path.startswith("/opt/cross:/usr/local/bin:")
+    assert "zlib1g-dev:arm64" in other._packages() or OTHER != "aarch64"
 
 
 def test_two_builds_in_one_folder(tmp_path: Path) -> None:
@@ -181,6 +244,6 @@ def test_two_builds_in_one_folder(tmp_path: Path) -> None:
 
 
 def test_the_copy_of_the_project_is_what_git_would_take(tmp_path: Path) -> None:
-    copy = Root(tmp_path, root.MIRROR, False)._copy_project()
+    copy = Root(tmp_path, root.MIRROR, False, HERE)._copy_project()
     assert (copy / "appliance/packaging/root.py").read_bytes() == Path(root.__file__).read_bytes()
     assert not list(copy.rglob("__pycache__")) and not list((copy / ".venv").iterdir())

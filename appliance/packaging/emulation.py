@@ -1,0 +1,50 @@
+"""Runs programs of another kind of computer here: qemu interprets them.
+
+Linux is told of qemu in a namespace of its own (binfmt_misc, which has one for each user namespace
+since Linux 6.7), so that nothing changes for the rest of the computer. Compilers need not be
+emulated: one of this computer's kind that makes code for the other is many times faster.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+#: Debian's names of the kinds of computers that there are executables for.
+ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64"}
+#: What systemd tells Linux at the start, where it runs: the interpreter of a kind of programs.
+RULES = Path("/usr/lib/binfmt.d")
+
+#: Where Linux is older, only the rules of the whole computer count. Debian's package sets them.
+_ENTER = """
+files=/proc/sys/fs/binfmt_misc
+rule=$0
+if mount -t binfmt_misc none $files 2>/dev/null; then cat "$rule" >$files/register; fi
+exec "$@"
+"""
+
+
+def is_foreign(machine: str) -> bool:
+    """Whether that (`x86_64`, `aarch64`) is another kind than this computer."""
+    return machine != os.uname().machine
+
+
+def prefix(machine: str) -> list[str]:
+    """What to put before a command that runs programs of that kind, or starts some that do.
+
+    It becomes root in a user namespace, to which no other users are known.
+    """
+    if not is_foreign(machine):
+        return []
+    enter = ["unshare", "--user", "--map-root-user", "--mount", "--propagation", "private"]
+    return [*enter, "sh", "-c", _ENTER, str(RULES / f"qemu-{machine}.conf")]
+
+
+def missing(machine: str) -> list[str]:
+    """Debian's packages that emulation of it needs and this computer lacks."""
+    if not is_foreign(machine):
+        return []
+    rule = RULES / f"qemu-{machine}.conf"
+    lacking = [] if rule.exists() else ["qemu-user-static"]
+    return lacking if shutil.which("unshare") else [*lacking, "util-linux"]
