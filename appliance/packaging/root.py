@@ -40,9 +40,12 @@ SOURCES = ("openssl", "sqlite3", "python3.11")
 PYTHON = "/usr/local/bin/python3.11"
 SYSTEM_PATH = ("/usr/sbin", "/usr/bin", "/sbin", "/bin")
 
-#: In the root: the tools, and the libraries that Python's modules are linked with.
+#: In the root: the tools, and the libraries that modules of Python and of wheels are linked with.
 TOOL_PACKAGES = ("build-essential", "ca-certificates", "pkg-config", "quilt", "tcl", "xz-utils")
-LIBRARIES = ("libbz2-dev", "libexpat1-dev", "libffi-dev", "liblzma-dev", "uuid-dev", "zlib1g-dev")
+LIBRARIES = (
+    *("libbz2-dev", "libexpat1-dev", "libffi-dev", "liblzma-dev", "libstdc++6", "uuid-dev"),
+    "zlib1g-dev",
+)
 #: The compiler and its tools for another kind of computer, under their usual names.
 CROSS_TOOLS = Path("/opt/cross")
 #: `ldd` of the root knows the loader of its own kind only.
