@@ -140,11 +140,11 @@ class Release:
         self._run(sys.executable, "-m", "appliance.packaging.root", *options, cwd=self._source)
         house = self._work / f"try-one-file-{machine}"
         house.mkdir()
-        command = Path(shutil.copy2(made / "appliance", house))
+        shutil.copy2(made / "appliance", house)
         # It sees that folder and the root, which has neither our Python nor our libraries.
-        bind = ("--bind", house, house, "--chdir", house)
+        bind = ("--bind", house, "/tmp/try", "--chdir", "/tmp/try")
         within = (*root.sandbox(cache / "root", machine), *bind)
-        self._use(command, house, f"appliance {version}, compiled", within)
+        self._use(Path("./appliance"), house, f"appliance {version}, compiled", within)
         (package,) = made.glob("*.deb")
         self._run("dpkg-deb", "--info", package, cwd=made)
         shutil.move(made / "appliance", self.out / f"appliance-{version}-linux-{machine}")
