@@ -66,11 +66,14 @@ class Python:
         """Raises WheelError if the appliance does not run with it, or nothing compiles for it."""
         try:
             told = subprocess.run(
-                [command, "-c", _ASK], capture_output=True, text=True, timeout=60, check=True
+                [command, "-c", _ASK], capture_output=True, text=True, timeout=60, check=False
             )
             name, executable, header, suffix, kind = json.loads(told.stdout)
-        except (OSError, subprocess.SubprocessError, ValueError) as error:
+        except (OSError, subprocess.SubprocessError) as error:
             raise WheelError(f"{command} is no Python that runs ({error})") from None
+        except ValueError:
+            reason = (told.stderr.strip() or f"it ended with {told.returncode}").splitlines()[0]
+            raise WheelError(f"{command} is no Python that runs ({reason})") from None
         if kind != "cpython" or name.removeprefix("python") not in _VERSIONS:
             least, most = _VERSIONS[0], _VERSIONS[-1]
             raise WheelError(f"{command} is {kind}'s {name}; it takes CPython {least} to {most}")

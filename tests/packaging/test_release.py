@@ -211,8 +211,17 @@ def test_pythons_that_are_none_of_ours(tmp_path: Path) -> None:
     ):
         with pytest.raises(wheels.WheelError, match=re.escape(reason)):
             wheels.Python.at(claims(*python))
-    for command in ("/bin/false", tmp_path / "none", tmp_path):
-        with pytest.raises(wheels.WheelError, match="is no Python that runs"):
+    shim = tmp_path / "shim"
+    shim.write_text("#!/bin/sh\necho 'pyenv: python3.12: command not found' >&2; exit 127\n")
+    shim.chmod(0o755)
+    reasons = {
+        shim: r"shim is no Python that runs \(pyenv: python3.12: command not found\)$",
+        "/bin/false": r"is no Python that runs \(it ended with 1\)$",
+        tmp_path / "none": "is no Python that runs .*No such file",
+        tmp_path: "is no Python that runs .*denied",
+    }
+    for command, reason in reasons.items():
+        with pytest.raises(wheels.WheelError, match=reason):
             wheels.Python.at(command)
     here = [python.name for python in wheels.pythons_here()]
     assert f"python3.{sys.version_info[1]}" in here and len(here) == len({*here})
