@@ -31,7 +31,8 @@ from appliance.web.site import Resource
 #: The most seconds that a code waits because of wrong ones from its address.
 MAX_WAIT: Final = 5.0
 
-#: The throttle's queue of codes: guesses of passwords do not delay them, and the other way round.
+#: The throttle's queue of codes: they do not wait behind guesses of passwords, nor these behind
+#: them. How long an address waits is the same for both.
 _QUEUE: Final = "enrol"
 
 _UNKNOWN: Final = Refusal(ReasonCode.NOT_AUTHORIZED, "unknown enrolment code")

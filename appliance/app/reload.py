@@ -218,12 +218,14 @@ class Reload:
     def _close_removed(self, names: list[str]) -> asyncio.Task[None] | None:
         """Close the connections of removed users, in the background: a user may have thousands.
 
-        Only those that there are now: who logs in from now on may do so by the new files, such as
-        by a certificate.
+        Only those that there are now, with those whose login began by the old files: who logs in
+        from now on may do so by the new ones, such as by a certificate.
         """
         parts, removed = self._parts, set(names)
         if not removed:
             return None
+        for connection in list(parts.listeners.scheduler.connections):
+            connection.users_removed(removed)
         # Plugins may know users that the file has not, so only those count that it had. And a
         # session inside the appliance has not logged in: the rules alone decide about it.
         connected = [

@@ -15,7 +15,7 @@ import os
 import socket
 import ssl
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import cast
 
@@ -747,6 +747,13 @@ class ClientConnection:
         self._resume_input()
 
     # --- the client's transport ----------------------------------------------------------------
+
+    def users_removed(self, names: Collection[str]) -> None:
+        """See `ScheduledConnection`. Who it is becomes known at the end only, so a login that is
+        under way counts as one of theirs."""
+        who = self._login_result
+        if self._logging_in or (isinstance(who, Identity) and who.username in names):
+            self.close()
 
     def authenticate(self, connect: Connect) -> None:
         """Authenticate the CONNECT in the background; nothing more is read until then."""

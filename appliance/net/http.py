@@ -397,7 +397,10 @@ class HttpLayer(MiddleLayer):
             self._refuse(400, "not a request")
             return
         self._method = event.method.decode("ascii")
-        if not event.http_version.startswith(b"1."):
+        if type(following) is h11.Data:
+            # h11 has found the end of the head earlier, behind a bare LF.
+            self._refuse(400, "a head has CRLF at the end of each line")
+        elif not event.http_version.startswith(b"1."):
             self._refuse(505, "HTTP/1.1 is spoken here")
         else:
             request = self._request(event)

@@ -129,6 +129,7 @@ class Listeners:
     ) -> None:
         self.broker = broker
         self.admission = admission
+        self._certificate_user = certificates.username if certificates is not None else None
         self._make_site = site
         self._site: HttpSite | None = None
         self._addresses = _AddressLimits(admission)
@@ -282,7 +283,8 @@ class Listeners:
 
     def _layer(self, listener: ListenerSettings) -> _Layer:
         if listener.protocol == "websocket":
-            return partial(WebSocket, scheduler=self.scheduler)
+            user = self._certificate_user
+            return partial(WebSocket, scheduler=self.scheduler, certificate_user=user)
         if listener.protocol == "web":
             # Not before: it takes time and memory at the start.
             from appliance.net.http import HttpLayer

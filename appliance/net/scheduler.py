@@ -13,7 +13,7 @@ import math
 import socket
 import ssl
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable
 from functools import partial
 from typing import Protocol, TypeAlias, TypeVar
 
@@ -78,6 +78,9 @@ class CertificatePolicy(Protocol):
     def refusal(self, tls: ssl.SSLObject) -> str:
         """Why the certificate is not, or no longer, accepted; empty when it is."""
 
+    def username(self, tls: ssl.SSLObject) -> str | None:
+        """The user that the certificate names, None for none. ValueError refuses the client."""
+
 
 class ScheduledConnection(Schedulable, Protocol):
     """A connection as the scheduler and the listeners see it."""
@@ -95,6 +98,9 @@ class ScheduledConnection(Schedulable, Protocol):
 
     def abort(self) -> None:
         """Close at once."""
+
+    def users_removed(self, names: Collection[str]) -> None:
+        """Close the connection if its login is under way, or decided for one of these users."""
 
     def make_room(self) -> None:
         """Close at once, to make room for another connection."""

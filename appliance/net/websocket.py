@@ -17,6 +17,7 @@ from websockets.typing import Subprotocol
 
 from appliance.net.callbacks import contained, contained_made
 from appliance.net.layers import LayerHandler, LayerScheduler, MiddleLayer
+from appliance.net.origin import REFUSAL, CertificateUser, misuses_certificate
 
 #: The path, and the subprotocols: "mqtt" of the standard, the other one of clients before it.
 PATH = "/mqtt"
@@ -279,13 +280,20 @@ class WebSocketLayer(MiddleLayer):
 class WebSocket(WebSocketLayer):
     """The server's side.
 
-    The Origin header is not checked: no browser adds an MQTT password by itself.
+    The Origin header counts only where a client's certificate is its login: no browser adds an MQTT
+    password by itself. What is the `certificate_user` is in `origin`; None for no check.
     """
 
     _frames: _Frames
 
-    def __init__(self, protocol: WebSocketHandler, scheduler: LayerScheduler) -> None:
+    def __init__(
+        self,
+        protocol: WebSocketHandler,
+        scheduler: LayerScheduler,
+        certificate_user: CertificateUser | None = None,
+    ) -> None:
         super().__init__(protocol, scheduler, _Frames(logger=library_log))
+        self._certificate_user = certificate_user
 
     def _receive_head(self, data: bytes) -> bytes:
         """Answer the HTTP request once it is complete; returns the bytes behind it."""
@@ -318,6 +326,9 @@ class WebSocket(WebSocketLayer):
         if request.path.partition("?")[0] != PATH:
             self._refuse(404, f"nothing is here; MQTT over WebSocket is at {PATH}", request.path)
             return False
+        if self._is_foreign(request):
+            self._refuse(403, REFUSAL)
+            return False
         size = 0
         for name, value in request.headers.raw_items():
             if not name.lower().startswith(_OWN_HEADERS):
@@ -338,6 +349,14 @@ class WebSocket(WebSocketLayer):
         frames.send_response(response)
         self._send(frames.data_to_send())
         return True
+
+    def _is_foreign(self, request: Request) -> bool:
+        origins = request.headers.get_all("Origin")
+        user = self._certificate_user
+        if user is None or not origins:
+            return False
+        host = ", ".join(request.headers.get_all("Host"))
+        return misuses_certificate(origins, host, self.get_extra_info("ssl_object"), user)
 
     def _refuse(self, status: int | None, reason: str, path: str | None = None) -> None:
         response = None if status is None else self._frames.reject(status, f"{reason}\n")

@@ -37,6 +37,9 @@ LONGEST: Final = 1024 * 1024
 #: The most bytes of an error that is an answer to a call, if its code is to be the status.
 LONGEST_ERROR: Final = 16 * 1024
 
+#: The most bytes of the topic of a call: that of its answer is longer by the ids in it.
+LONGEST_CALLED: Final = 0xFFFF - 128
+
 #: The most work that the values of a body may be, in the unit of `Cost`: of lists and objects a few
 #: bytes are as much as a hundred of text, and everybody waits while they are read.
 MOST_VALUES: Final = 100_000
@@ -145,7 +148,7 @@ class Api:
     async def _call(self, request: HttpRequest) -> HttpResponse:
         async def call(client: CarriedClient) -> HttpResponse:
             wanted = await self._body(request)
-            topic = _topic(wanted)
+            topic = _topic(wanted, LONGEST_CALLED)
             timeout = _take(wanted, "timeout", (int, float), TIMEOUT)
             payload = _as_json(wanted.pop("payload", {}))
             _no_more(wanted)
@@ -270,11 +273,12 @@ def _as_json(payload: object) -> bytes:
         raise HttpError(400, f"payload: {error}") from None
 
 
-def _topic(wanted: dict[str, Any]) -> str:
+def _topic(wanted: dict[str, Any], longest: int = 0xFFFF) -> str:
     topic: str = _take(wanted, "topic", str, "")
     try:
         check_topic(topic)
-        topic.encode()
+        if len(topic.encode()) > longest:
+            raise HttpError(400, f"topic: at most {longest} bytes")
     except (ProtocolError, ValueError) as error:
         raise HttpError(400, f"topic: {str(error)[:200]}") from None
     return topic

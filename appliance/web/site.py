@@ -7,7 +7,6 @@ rebinding), but not by a name of our certificate or by an address; so other host
 from __future__ import annotations
 
 import ipaddress
-import ssl
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -15,6 +14,7 @@ from urllib.parse import urlsplit
 
 from appliance.mqtt.codec import quote
 from appliance.net.http import HttpRequest, HttpResponse, text
+from appliance.net.origin import REFUSAL, CertificateUser, is_foreign, misuses_certificate
 from appliance.net.websocket import PATH
 
 #: The methods of what can only be looked at.
@@ -43,7 +43,7 @@ class WebSite:
         self,
         resources: Mapping[str, Resource],
         names: Callable[[], Collection[str]],
-        certificate_user: Callable[[ssl.SSLObject], str | None],
+        certificate_user: CertificateUser,
     ) -> None:
         self._resources = {PATH: Resource(_needs_upgrade, ("GET",)), **resources}
         self._names = names
@@ -60,7 +60,9 @@ class WebSite:
         if request.method not in resource.methods:
             allowed = ", ".join(resource.methods)
             return text(405, f"use one of: {allowed}", ("Allow", allowed))
-        if request.method not in LOOK and _has_foreign_origin(request):
+        if request.method not in LOOK and is_foreign(
+            _origins(request), request.host, tls=request.tls is not None
+        ):
             return text(403, "a page of another site may not change anything here")
         return await resource.respond(request)
 
@@ -85,25 +87,14 @@ class WebSite:
 
     def _foreign(self, request: HttpRequest) -> HttpResponse | None:
         """Refuse another site's page where the browser logs in by itself, by its certificate."""
-        if request.tls is None or not _has_foreign_origin(request):
+        user = self._certificate_user
+        if not misuses_certificate(_origins(request), request.host, request.tls, user):
             return None
-        try:
-            owner = self._certificate_user(request.tls)
-        except ValueError:
-            owner = None  # its login will be refused
-        if owner is None:
-            return None
-        return text(403, "a page of another site may not use this client's certificate")
+        return text(403, REFUSAL)
 
 
-def _has_foreign_origin(request: HttpRequest) -> bool:
-    """Whether a page of another site has the browser ask; who is no browser sends no Origin.
-
-    On a listener without TLS a proxy may have added that, and its page's Origin says https.
-    """
-    given = [value.lower() for name, value in request.headers if name == "origin"]
-    schemes = ("http", "https") if request.tls is None else ("https",)
-    return bool(given) and given not in [[f"{each}://{request.host}".lower()] for each in schemes]
+def _origins(request: HttpRequest) -> list[str]:
+    return [value for name, value in request.headers if name == "origin"]
 
 
 def is_named(host: str, names: Collection[str]) -> bool:

@@ -283,6 +283,26 @@ async def test_bad_bodies(web: WebApp):
     assert (await post(web, "publish", GOOD))[0] == 200
 
 
+async def test_a_call_whose_answer_has_no_topic(web: WebApp):
+    for size, expected in ((65_500, 400), (api.LONGEST_CALLED - 1, 400), (65_300, 403)):
+        status, _, error = await post(web, "call", {"topic": "a" * size + "/x"})
+        assert status == expected, size  # the fixture sees that nothing was a fault
+        assert ("at most" in error["error"]["message"]) is (expected == 400)
+
+
+@pytest.mark.parametrize("gap", ["\n\nAAAAAA", "\n\r\nAA", "\n\n" + "A" * 8000])
+async def test_a_head_that_ends_earlier_for_the_library(web: WebApp, gap: str):
+    """What is between would be read twice, and the rest as the next request."""
+    peer = await web.dial()
+    fields = {**basic(), "Content-Type": "application/json", "Content-Length": "40000"}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    head = f"POST /api/v1/publish HTTP/1.1\r\nHost: localhost\r\n{lines}"
+    await peer.send(head.removesuffix("\r\n").encode() + gap.encode() + b"\r\n\r\n")
+    status, headers, _ = await answer(peer)
+    assert (status, headers["connection"]) == (400, "close")
+    assert await peer.receive_rest() == b""
+
+
 async def test_values_that_are_more_work_than_their_bytes(web: WebApp):
     """All others would wait for a tenth of a second while they are read."""
     lists = b'{"topic": "r2d2/a", "payload": [%s[]]}' % (b"[]," * 300_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 from appliance.access import Changes
 from appliance.app.reload import Reload, ReloadParts, _of_users
@@ -66,6 +67,15 @@ async def test_a_user_who_is_removed_ends_logins_and_nothing_that_has_not_logged
     assert link.closed == [ReasonCode.ADMINISTRATIVE_ACTION]
     assert not inside.closed and not other.closed
     assert _of_users(Changes([], ["eve"], [], False)) == ["users removed: eve"]
+
+
+async def test_connections_that_are_logging_in_are_told_who_is_removed() -> None:
+    told: list[set[str]] = []
+    reload = with_listeners(Broker(cast(Access, AllAllowed()), MemoryStore()))
+    connection = Mock(users_removed=told.append)
+    reload._parts.listeners.scheduler.connections.add(connection)
+    await close_removed(reload, "eve")
+    assert told == [{"eve"}]
 
 
 class Leaving(Link):

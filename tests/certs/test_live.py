@@ -186,6 +186,37 @@ def test_a_certificate_is_a_login(unchanged: ApplianceProcess) -> None:
         assert peer.log_in("d", "tablet") == ReasonCode.NOT_AUTHORIZED
 
 
+UPGRADE = (
+    "GET /mqtt HTTP/1.1\r\nHost: robot:1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+    "Sec-WebSocket-Protocol: mqtt\r\n{}\r\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("certificate", "origins", "status"),
+    [
+        ("tablet", [], 101),
+        ("tablet", ["https://robot:1"], 101),
+        ("tablet", ["https://evil.example"], 403),
+        ("tablet", ["http://robot:1"], 403),
+        ("tablet", ["null"], 403),
+        ("tablet", ["https://robot:1", "https://evil.example"], 403),
+        (None, ["https://evil.example"], 101),  # whose page has to know a password
+    ],
+)
+def test_a_page_of_another_site_cannot_use_a_browsers_certificate(
+    unchanged: ApplianceProcess, certificate: str | None, origins: list[str], status: int
+) -> None:
+    """A listener for WebSocket alone; `tests/web` has the one for the web."""
+    port = _ports(unchanged)[2]
+    with socket.create_connection((HOST, port), PATIENCE) as plain:
+        tls = context_of(unchanged, certificate).wrap_socket(plain, server_hostname=HOST)
+        fields = "".join(f"Origin: {each}\r\n" for each in origins)
+        tls.sendall(UPGRADE.format(fields).encode())
+        assert tls.recv(4096).startswith(f"HTTP/1.1 {status} ".encode())
+
+
 def test_a_session_of_the_certificates_user_is_no_one_elses(unchanged: ApplianceProcess) -> None:
     with Peer(unchanged, "tablet") as peer:
         assert peer.log_in("mine") == 0

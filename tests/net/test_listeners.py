@@ -440,6 +440,29 @@ async def test_stop_during_a_login(harness: Harness):
     assert not harness.broker.sessions
 
 
+@pytest.mark.parametrize("is_decided", [False, True])
+async def test_a_user_who_is_removed_during_the_login(harness: Harness, monkeypatch, is_decided):
+    """Its connection is not in a session yet, and was decided by what is no longer so."""
+    harness.gate.clear()
+    await harness.start()
+    peer, other = await harness.dial(), await harness.dial()
+    # A login that is decided waits for its turn while the others have much to do.
+    monkeypatch.setattr(type(harness.scheduler), "is_busy", lambda _: is_decided)
+    monkeypatch.setattr(wire.ClientConnection, "_resume_input_later", lambda _: None)
+    await peer.send(Connect("a", username="eve", password=b"secret"))
+    await until(lambda: any(each._logging_in for each in harness.scheduler.connections))
+    if is_decided:
+        harness.gate.set()
+        await until(lambda: not any(each._logging_in for each in harness.scheduler.connections))
+    for connection in list(harness.scheduler.connections):
+        connection.users_removed({"eve"})
+    harness.gate.set()
+    assert await peer.receive_rest() == b""
+    assert not harness.broker.sessions
+    assert len(harness.scheduler.connections) == 1, "who has not begun to log in stays"
+    other.hang_up()
+
+
 async def test_an_address_in_use(harness: Harness):
     """Nothing is left listening, and the message names the key."""
     with socket.create_server(("127.0.0.1", 0)) as taken:

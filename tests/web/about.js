@@ -43,6 +43,14 @@ const wrong = [null, 7, 'a', [], {}, route({ ros: 1 }), route({ mqtt: 'r/#' }), 
 take(about, 'r', [...wrong, route()])
 assert.deepEqual(about.told(), [['r', 'routes', [route()]]])
 
+// Another robot names no topic of this appliance, nor a group of subscribers, whose messages a page would take.
+const inside = [route({ mqtt: '$CONTROL/appliance/v1/reload' }), route({ mqtt: '$SYS/a' })]
+const group = route({ mqtt: '$share/workers/jobs' })
+take(about, 'r', [...inside, group])
+assert.deepEqual(about.told(), [['r', 'routes', inside]])
+take(about, 'eve', [...inside, group, route()])
+assert.deepEqual(about.told(), [['eve', 'routes', [route()]]])
+
 // So many robots; what is taken back, or was never there, takes no room.
 about = new About('r')
 for (let n = 0; n < 1000; n += 1) take(about, `x${n}`, '')

@@ -47,4 +47,21 @@ for (let n = 0; n < 100; n += 1) {
   assert.ok(message.leaves.length === 900 && message.leaves.every(([path]) => path.length <= 501))
 }
 assert.ok(nesting.history.length === 100 && nesting.texts.size <= 4)
+// Messages of TF that wait while one is read.
+const { default: MapView } = await import(`${process.argv[2]}/map-link.js`)
+const heard = {}
+const robot = { on(event, take) { heard[event] = take }, subscribe() {}, end() {} }
+const view = new MapView(() => robot, { topics: {}, tf: [['tf', false], ['tf_static', true]] })
+for (const topic of ['tf', 'tf_static']) {
+  for (let n = 0; n < 100; n += 1) heard.message(topic, new Uint8Array(1024 * KIB), {})
+  for (let n = 0; n < 600; n += 1) heard.message(topic, new Uint8Array(1 + n % 2), {})
+}
+for (const waiting of [view.told, view.toldOnce]) {
+  assert.equal(waiting.messages.length, 500)
+  assert.equal(waiting.bytes, 750)
+  for (let n = 0; n < 100; n += 1) waiting.add({ payload: new Uint8Array(1024 * KIB) })
+  assert.ok(waiting.bytes === 8 * KIB * KIB && waiting.messages.length === 8)
+  waiting.add({ payload: new Uint8Array(17 * KIB * KIB) })
+  assert.deepEqual([waiting.take(), waiting.bytes], [[], 0])
+}
 console.log('ok')

@@ -88,9 +88,12 @@ export class About {
   }
 }
 
-/** Whether an entry of another robot is one, and can be shown. */
+/**
+ * Whether an entry of another robot is one, and can be shown. It names no topic with `$`: whoever calls or publishes
+ * there means this appliance itself.
+ */
 function isShort(entry) {
-  return isRoute(entry) && ['ros', 'mqtt', 'type'].every((name) => entry[name].length <= NAME)
+  return isRoute(entry) && !entry.mqtt.startsWith('$') && ['ros', 'mqtt', 'type'].every((name) => entry[name].length <= NAME)
 }
 
 /** The value with its texts, lists and objects cut: a page shows no more, and nobody else minds what is in it. */

@@ -8,6 +8,26 @@ import { Watch } from './watch-link.js'
 
 const RATES = { grid: 1, pose: 10, scan: 5 } // messages a second
 const MOST_WAITING = 500 // messages of TF, each of which may tell of other frames
+const BYTES_WAITING = 8 * 1024 * 1024 // of all of them
+
+/** Messages that wait to be read, the newest of them as far as there is room. */
+class Waiting {
+  messages = []
+  bytes = 0
+
+  add(message) {
+    this.messages.push(message)
+    this.bytes += message.payload.length
+    while (this.messages.length > MOST_WAITING || this.bytes > BYTES_WAITING) {
+      this.bytes -= this.messages.shift().payload.length
+    }
+  }
+
+  take() {
+    this.bytes = 0
+    return this.messages.splice(0)
+  }
+}
 
 export default class MapView {
   /**
@@ -16,8 +36,8 @@ export default class MapView {
    */
   constructor(open, { topics, isCloud, tf = [] }) {
     this.transforms = tf.length ? new Transforms() : null
-    this.told = [] // of TF: what is to be read
-    this.toldOnce = [] // and of what is static: nobody tells it again, so that /tf must not push it out
+    this.told = new Waiting() // of TF: what is to be read
+    this.toldOnce = new Waiting() // and of what is static: nobody tells it again, so that /tf must not push it out
     this.known = {} // of each part its frame and time
     this.readers = { grid: gridOf, pose: poseOf, scan: isCloud ? cloudOf : scanOf }
     this.newest = {}
@@ -28,8 +48,7 @@ export default class MapView {
       const transform = tf.find(([name]) => name === topic)
       if (transform) {
         const told = transform[1] ? this.toldOnce : this.told
-        told.push({ payload, properties, isStatic: transform[1] })
-        if (told.length > MOST_WAITING) told.shift()
+        told.add({ payload, properties, isStatic: transform[1] })
       }
       for (const part of parts) {
         if (topics[part] === topic) this.newest[part] = { payload, properties, at }
@@ -68,7 +87,7 @@ export default class MapView {
   async placements() {
     const { transforms, known } = this
     transforms.problem = ''
-    for (const { payload, properties, isStatic } of [...this.toldOnce.splice(0), ...this.told.splice(0)]) {
+    for (const { payload, properties, isStatic } of [...this.toldOnce.take(), ...this.told.take()]) {
       try {
         transforms.take(await valueOf(payload, properties), isStatic)
       } catch (error) {
