@@ -7,13 +7,14 @@ than the user could.
 
 from __future__ import annotations
 
+import builtins
 import contextlib
-import encodings.utf_8_sig  # noqa: F401 - Python may be where only root can read, and loads it late
 import os
 import pwd
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 _ROOT = 0
 
@@ -63,8 +64,25 @@ def acting_for(*paths: Path | None) -> Iterator[None]:
         group, groups = uid, []
     else:
         group, groups = user.pw_gid, os.getgrouplist(user.pw_name, user.pw_gid)
-    with _being(uid, group, groups):
+    with _importing_as_caller(), _being(uid, group, groups):
         yield
+
+
+@contextlib.contextmanager
+def _importing_as_caller() -> Iterator[None]:
+    """Within it what is imported is read by the caller: Python may be where only root can read, as
+    what the one file has unpacked is."""
+    load = builtins.__import__
+
+    def load_as_caller(*arguments: Any, **named: Any) -> Any:
+        with acting_as_caller():
+            return load(*arguments, **named)
+
+    builtins.__import__ = load_as_caller
+    try:
+        yield
+    finally:
+        builtins.__import__ = load
 
 
 @contextlib.contextmanager

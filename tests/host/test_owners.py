@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import builtins
+import contextlib
 import os
 import shutil
 import subprocess
@@ -90,6 +92,7 @@ def test_root_writes_as_the_owner_of_the_configuration(home: Path) -> None:
     [
         "user add bob --generate",
         "user add bob --scram --generate",
+        "user add bob --group viewers --generate",
         "user passwd operator --generate",
         "cert issue tablet --pkcs12 --bundle --generate",
         "cert renew all",
@@ -106,6 +109,31 @@ def test_what_is_loaded_late_is_found(home: Path, command: str) -> None:
         timeout=PATIENCE,
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_modules_that_only_root_can_read_are_imported(
+    home: Path, etc: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    """As those are that the one file unpacks for root."""
+    etc.chmod(0o700)
+    (etc / "loaded_late.py").write_text("import os\nuser = os.geteuid()\n")
+    (etc / "fails_late.py").write_text("raise ImportError('broken')\n")
+    monkeypatch.syspath_prepend(str(etc))
+    load = builtins.__import__
+    with contextlib.suppress(ZeroDivisionError), acting_for(home):
+        import loaded_late  # type: ignore[import-not-found]
+
+        assert loaded_late.user == 0
+        with pytest.raises(ImportError, match="broken"):
+            import fails_late  # type: ignore[import-not-found]  # noqa: F401
+        assert os.geteuid() == SERVICE
+        with pytest.raises(PermissionError):
+            (etc / "shadow").read_text()
+        if fails:
+            raise ZeroDivisionError
+    assert os.geteuid() == 0 and builtins.__import__ is load
+    monkeypatch.delitem(sys.modules, "loaded_late")
 
 
 def test_links_lead_root_nowhere(home: Path, etc: Path) -> None:
