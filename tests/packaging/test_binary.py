@@ -30,11 +30,13 @@ from waiting import eventually, until
 pytest.importorskip("rclpy")
 pytest.importorskip("test_msgs.action")
 pytest.importorskip("PyInstaller")
+from rclpy.serialization import serialize_message
 from robot_client import TURTLE, V5, Client
 from robot_process import Robot
 from ros2_harness import Peer, string
 from ros_domain import isolated_domain
 from rover_workspace import DRIVE, VALUE, build_workspace
+from sensor_msgs.msg import Image, LaserScan
 
 __all__ = ["isolated_domain"]  # a fixture
 
@@ -416,6 +418,55 @@ async def test_topics_services_and_actions_with_other_nodes(box, bare_root):
     finally:
         await peer.stop()
         robot.stop()
+
+
+async def test_every_encoding(box):
+    """Some libraries import a module when they first encode a value that wants it."""
+    scan = LaserScan(ranges=[1.0, 2.0])
+    image = Image(height=2, width=2, encoding="rgb8", step=6, data=bytes(12))
+    said = {
+        "/chatter": ("std_msgs/msg/String", string("hello")),
+        "/image": ("sensor_msgs/msg/Image", serialize_message(image)),
+        "/scan": ("sensor_msgs/msg/LaserScan", serialize_message(scan)),
+    }
+    #: Of each topic on MQTT its source, its encoding, and what is in each message.
+    told = {
+        "json": ("/chatter", {"encoding": "json"}, b'{"data":"hello"}'),
+        "cbor": ("/chatter", {"encoding": "cbor"}, b"\xa1ddataehello"),
+        "cdr": ("/chatter", {"encoding": "cdr"}, string("hello")),
+        "text": ("/chatter", {"encoding": "text"}, b"hello"),
+        "zstd": ("/chatter", {"compression": "zstd"}, bytes.fromhex("28b52ffd")),
+        "jpeg": ("/image", {"encoding": "jpeg"}, b"\xff\xd8\xff"),
+        "png": ("/image", {"encoding": "png"}, b"\x89PNG"),
+        "numbers": ("/scan", {"encoding": "cbor"}, b"franges\xd8\x55\x48"),  # RFC 8746
+    }
+    routes = [
+        {"ros": source, "to": "mqtt", "mqtt": f"{ROBOT}/as/{name}", **options}
+        for name, (source, options, _) in told.items()
+    ]
+    back = {"ros": "/said", "to": "ros", "type": "std_msgs/msg/String", "encoding": "cbor"}
+    house = box({"topics": [*routes, back]})
+    peer = Peer()
+    try:
+        await peer.start()
+        await peer.do("subscribe", "/said", "std_msgs/msg/String")
+        for topic, (kind, _) in said.items():
+            await peer.do("advertise", topic, kind)
+            await peer.do("matched", topic)
+        for name, (source, _, part) in told.items():
+            listener = house.listen(f"{ROBOT}/as/{name}", "-C", "1", "-F", "%x")
+            while listener.poll() is None:
+                await peer.do("publish", source, said[source][1].hex())
+                assert "a fault in the appliance" not in house.log
+            assert part in bytes.fromhex(listener.communicate()[0]), name
+        publisher = house.publish(f"{ROBOT}/said", b"\xa1ddataehello")
+        await until(lambda: peer.received, "the message on /said")
+        publisher.kill()
+        publisher.wait()
+        assert bytes.fromhex(peer.received[0][1]).startswith(string("hello"))
+    finally:
+        await peer.stop()
+    assert "a fault in the appliance" not in house.log
 
 
 def overlay(root, name, package):
