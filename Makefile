@@ -104,7 +104,7 @@ $(KILTED)/test.stamp: pyproject.toml constraints.txt tests/ros/kilted.txt
 	@test -x $(KILTED)/bin/pip || $(PYTHON) -m venv $(KILTED)
 	@grep -v '^ros-' constraints.txt > $(KILTED)/constraints.txt
 	@$(KILTED)/bin/pip install -q --use-pep517 --disable-pip-version-check -c $(KILTED)/constraints.txt -e '.[camera]' \
-	  -r tests/ros/kilted.txt hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist
+	  -r tests/ros/kilted.txt hypothesis jinja2 jsonschema pytest pytest-asyncio pytest-timeout pytest-xdist
 	@touch $@
 
 .venv/binary.stamp: .venv/run.stamp
