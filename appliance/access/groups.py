@@ -86,6 +86,22 @@ def leave(acl: Path, robot: str, user: str) -> None:
         join(acl, robot, user, ())
 
 
+def own_rules(acl: Path, user: str) -> list[int]:
+    """The lines of the rules that the user has beside its groups.
+
+    Raises:
+        AccessFileError: the file cannot be read.
+    """
+    found: list[int] = []
+    current: str | None = None
+    for number, line in enumerate(read_text(acl, _ADVICE).split("\n"), 1):
+        if named := _USER.fullmatch(line):
+            current = named[1]
+        elif current == user and line.strip().startswith("topic "):
+            found.append(number)
+    return found
+
+
 def _with_groups(text: str, user: str, wanted: list[str]) -> str:
     """The rules with these groups for the user, at its first `user` line or at the end."""
     lines = [f"include {FOLDER}/{name}.conf" for name in wanted]

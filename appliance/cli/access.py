@@ -95,6 +95,7 @@ def user_remove(name: str, config: ConfigOption = None) -> None:
 
     settings = load(config)
     acl = settings.broker.acl
+    left: list[int] = []
     with _users(settings) as users:
         try:
             users.remove(name)
@@ -103,7 +104,12 @@ def user_remove(name: str, config: ConfigOption = None) -> None:
         users.save()
         if acl.exists():  # plugins may stand in for it
             groups.leave(acl, settings.robot, name)
+            left = groups.own_rules(acl, name)
     typer.echo(f"user {name} removed")
+    if left:
+        lines = ", ".join(map(str, left))
+        whose = f"its own rules stay in {shown(acl)} (line {lines})"
+        typer.echo(f"{whose}: a new user of that name would have these rights")
     _note(settings, "user removed", name)
 
 

@@ -165,7 +165,10 @@ def check(
 
 
 def demo(config: ConfigOption = None) -> None:
-    """Run the appliance with a demo robot, and print the commands to see and drive it."""
+    """Run the appliance with a demo robot, and print the commands to see and drive it.
+
+    `appliance init --demo` writes the configuration for it.
+    """
     settings = load(config)
     from appliance.cli import demo as demo_appliance
     from appliance.ops import logs

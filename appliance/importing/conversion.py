@@ -16,7 +16,7 @@ from appliance.importing.reading import Reader
 
 _HEAD = """\
 # Made from {name} by `appliance import`. What is left out has a safe default; every key,
-# its default and why it is there: the appliance.yaml at the top of this project.
+# its default and why it is there: the appliance.yaml of the project, or `appliance check --show`.
 
 """
 

@@ -32,8 +32,9 @@ PASSWORD_FILE = "user.password"
 _PASSWORD_LENGTH = 20  # of 62 characters each: 119 bits
 
 CONFIGURATION = """\
-# What is left out has a safe default. Every key, its default and why it is there:
-# the appliance.yaml at the top of this project. `appliance check` names every mistake.
+# What is left out has a safe default. `appliance check` names every mistake, and with --show prints
+# every setting in force. The project's own appliance.yaml explains each (of the Debian package:
+# /usr/share/doc/appliance/examples/appliance.yaml).
 
 robot: {robot}          # the first level of all its MQTT topics
 
@@ -314,11 +315,11 @@ def _filter(part: str) -> str:
 
 
 def _write_rules(path: Path, rules: str, calls: str) -> bool:
-    """Write the access rules, and before them the groups, unless there are rules already."""
-    if path.exists():
-        return False
-    for name, text in GROUPS.items():
-        write_new(path.parent / "groups" / name, text.format(calls=calls))
+    """Write the access rules, unless there are some already, and the groups that they include."""
+    folder = path.parent / "groups"
+    if not path.exists() or "include groups/" in path.read_text(errors="replace"):
+        for name, text in GROUPS.items():
+            write_new(folder / name, text.format(calls=calls))
     return write_new(path, rules)
 
 

@@ -273,8 +273,18 @@ def test_users(
     acl = here / "acl.conf"
     before = groups.members(acl)
     groups.join(acl, "r2", "bob", ["drivers"])
+    output.readouterr()
     assert run("user", "remove", "bob") == 0
     assert groups.members(acl) == before
+    assert output.readouterr().out == "user bob removed\n"
+
+    assert run("user", "add", "carol", "--generate", "--group", "viewers") == 0
+    line = acl.read_text().count("\n")
+    acl.write_text(acl.read_text() + "# hers\ntopic read {robot}/lab/#\n")
+    output.readouterr()
+    assert run("user", "remove", "carol") == 0
+    told = f"its own rules stay in acl.conf (line {line + 1}): a new user of that name"
+    assert told in output.readouterr().out
     for command in ("remove", "passwd"):
         assert run("user", command, "bob") == 1
         assert "there is no user 'bob' in users.passwd" in output.readouterr().err

@@ -22,6 +22,7 @@ from appliance.cli import main as cli
 
 #: The variables with the ports of its listeners.
 PORTS = ("APPLIANCE_PORT", "APPLIANCE_PLAIN_PORT", "APPLIANCE_WEB_PORT")
+from appliance.ops.init import initialise
 
 
 @pytest.fixture
@@ -144,6 +145,13 @@ async def test_a_demo_that_runs_already(demo: Path) -> None:
             await asyncio.to_thread(tour.run, settings)
     finally:
         await first.stop()
+
+
+def test_a_configuration_that_is_not_the_demos(tmp_path: Path) -> None:
+    list(initialise(tmp_path))
+    settings = config.load(tmp_path / "appliance.yaml")
+    with pytest.raises(tour.DemoError, match=r"no route for .* /odom: .*appliance init --demo"):
+        tour.run(settings)
 
 
 def test_the_demo_needs_tls(demo: Path) -> None:

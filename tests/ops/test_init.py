@@ -191,6 +191,20 @@ def test_only_what_is_missing_is_made(tmp_path: Path) -> None:
     assert {finding.level for finding in findings} <= {"ok", "warning"}
 
 
+def test_a_group_that_is_missing_is_made_where_groups_are_used(tmp_path: Path) -> None:
+    list(initialise(tmp_path))
+    rules = (tmp_path / "acl.conf").read_bytes()
+    viewers = tmp_path / "groups/viewers.conf"
+    content = viewers.read_bytes()
+    viewers.unlink()
+    assert made(list(initialise(tmp_path))) == set()
+    assert viewers.read_bytes() == content and (tmp_path / "acl.conf").read_bytes() == rules
+    (tmp_path / "acl.conf").write_text("user operator\ntopic readwrite #\n")
+    viewers.unlink()
+    list(initialise(tmp_path))
+    assert not viewers.exists()
+
+
 PROJECT = Path(__file__).parents[2]
 
 
