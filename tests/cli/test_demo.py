@@ -19,10 +19,10 @@ from waiting import PATIENCE
 from appliance import config
 from appliance.cli import demo as tour
 from appliance.cli import main as cli
+from appliance.ops.init import initialise
 
 #: The variables with the ports of its listeners.
 PORTS = ("APPLIANCE_PORT", "APPLIANCE_PLAIN_PORT", "APPLIANCE_WEB_PORT")
-from appliance.ops.init import initialise
 
 
 @pytest.fixture
