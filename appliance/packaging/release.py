@@ -144,7 +144,7 @@ class Release:
         # It sees that folder and the root, which has neither our Python nor our libraries.
         bind = ("--bind", house, "/tmp/try", "--chdir", "/tmp/try")
         within = (*root.sandbox(cache / "root", machine), *bind)
-        self._use(Path("./appliance"), house, f"appliance {version}, compiled", within)
+        self._use(Path("/tmp/try/appliance"), house, f"appliance {version}, compiled", within)
         (package,) = made.glob("*.deb")
         self._run("dpkg-deb", "--info", package, cwd=made)
         shutil.move(made / "appliance", self.out / f"appliance-{version}-linux-{machine}")
