@@ -254,11 +254,11 @@ def initialise(
     if data is not None:
         data = data.absolute()
         template = with_data(template, data, control or data / "control.sock")
-    made = write_new(file, template.format(robot=name))
+    made_file = write_new(file, template.format(robot=name))
     settings = config.load(file)
-    if robot and not made and settings.robot != name:
+    if robot and not made_file and settings.robot != name:
         raise InitError(f"{file} has robot: {settings.robot}; change it there")
-    yield InitStep(file, made, f"configuration of robot {settings.robot!r}")
+    yield InitStep(file, made_file, f"configuration of robot {settings.robot!r}")
     yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     rules = ACCESS.format(user=user) + (first.user_rules if first else "")
@@ -267,9 +267,24 @@ def initialise(
     if first is not None:
         yield from _link(settings, file, first)
     # The users come last, so that the password is the last thing shown.
-    yield from _users(settings, user, directory / PASSWORD_FILE if demo else None)
+    is_told = made_file and not demo and data is None and first is None
+    for step in _users(settings, user, directory / PASSWORD_FILE if demo else None):
+        if is_told and isinstance(step, Credentials):
+            yield NextSteps(_next_steps(settings, file, user))
+        yield step
     if first is not None:
         yield NextSteps(first.next_steps(settings.robot, file, demo=demo))
+
+
+def _next_steps(settings: config.Settings, file: Path, user: str) -> list[str]:
+    robot, rules = settings.robot, settings.broker.acl.name
+    option = "" if file.absolute().parent == Path.cwd() else f" -c {file}"
+    return [
+        f"start it: appliance run{option}",
+        f"{user} may read everything of {robot}, and write {robot}/cmd_vel; {rules} says who may "
+        "write what else, and what is not allowed there is refused",
+        f"bridge topics of ROS: {file.name} has examples",
+    ]
 
 
 def call_topics(bridge: config.BridgeSection) -> list[str]:

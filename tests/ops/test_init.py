@@ -14,7 +14,14 @@ from appliance import certs, config
 from appliance.access import Acl, Passwords
 from appliance.broker.values import Action, Identity
 from appliance.ops.check import check
-from appliance.ops.init import Credentials, InitError, InitStep, initialise, robot_name
+from appliance.ops.init import (
+    Credentials,
+    InitError,
+    InitStep,
+    NextSteps,
+    initialise,
+    robot_name,
+)
 
 
 def made(steps: list[InitStep | Credentials]) -> set[str]:
@@ -189,6 +196,18 @@ def test_only_what_is_missing_is_made(tmp_path: Path) -> None:
     assert (tmp_path / "certs/ca.crt").read_bytes() == authority
     findings = list(check(config.load(tmp_path / "appliance.yaml")))
     assert {finding.level for finding in findings} <= {"ok", "warning"}
+
+
+def test_what_comes_next_is_said_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder, start in ((tmp_path, "appliance run"), (Path("x"), "appliance run -c x/")):
+        (told,) = (step for step in initialise(folder, robot="r2") if isinstance(step, NextSteps))
+        assert told.texts[0].startswith(f"start it: {start}")
+        assert "operator may read everything of r2, and write r2/cmd_vel; acl.conf" in told.texts[1]
+        assert not any(isinstance(step, NextSteps) for step in initialise(folder))
+    for options in ({"demo": True}, {"data": tmp_path / "data"}):
+        steps = initialise(tmp_path / next(iter(options)), **options)  # type: ignore[arg-type]
+        assert not any(isinstance(step, NextSteps) for step in steps)
 
 
 def test_a_group_that_is_missing_is_made_where_groups_are_used(tmp_path: Path) -> None:
