@@ -138,6 +138,8 @@ class Release:
         cache = root.default_cache(machine)
         options = ("--machine", machine, "--cache", cache, "--out", made)
         self._run(sys.executable, "-m", "appliance.packaging.root", *options, cwd=self._source)
+        if (cache / root.OUTDATED).exists():
+            self._say(f"without security updates of Debian's {root.SUITE}: the mirror has none")
         house = self._work / f"try-one-file-{machine}"
         house.mkdir()
         shutil.copy2(made / "appliance", house)

@@ -31,6 +31,9 @@ PYTHON_RECIPE = Path(__file__).with_name("python.sh")
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 MIRROR = "http://deb.debian.org/debian"
 
+#: Is beside a root whose libraries have no security updates.
+OUTDATED = "without-security-updates"
+
 #: Its glibc is `symbols.FLOOR`.
 SUITE = "bullseye"
 #: Suites in which security updates and sources of the same Debian are.
@@ -201,10 +204,13 @@ class Root:
             *('--aptopt=Acquire::Languages "none"', '--aptopt=APT::Install-Recommends "false"'),
             *(f"--include={','.join(self._packages())}", SUITE, self._root),
         )
+        outdated = self._cache / OUTDATED
+        outdated.unlink(missing_ok=True)
         try:
             _run(*make, suite, security)
         except BuildError:  # a mirror can list what it does not have
             self._say("trying without security updates, which could not be fetched: see above")
+            outdated.touch()
             remove(self._root)
             _run(*make, suite)
         for file in NETWORK_FILES:  # it is read-only when these are mounted there

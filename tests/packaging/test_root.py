@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -213,6 +214,11 @@ def test_a_root_without_the_security_updates_is_made_again_and_said(
     Root(tmp_path, root.MIRROR, False, HERE)._make_root()
     assert len(made) == 2 and made[1] == made[0][:-1]
     assert "without security updates, which could not be fetched" in capsys.readouterr().err
+    assert (tmp_path / root.OUTDATED).exists(), "so that a release says it each time"
+    shutil.rmtree(tmp_path / "root")
+    monkeypatch.setattr(root, "_run", lambda *_: (tmp_path / "root/etc/ssl").mkdir(parents=True))
+    Root(tmp_path, root.MIRROR, False, HERE)._make_root()
+    assert not (tmp_path / root.OUTDATED).exists()
 
 
 def test_the_tools_for_another_kind_have_their_usual_names(
