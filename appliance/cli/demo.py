@@ -25,7 +25,6 @@ from appliance.ops.control import ControlError, ask
 from appliance.ops.init import PASSWORD_FILE
 from appliance.ros.ros2.installation import is_frozen
 
-ODOMETRY = "/odom"
 RESET = "/reset"  # a service of the demo robot that the demo's configuration bridges
 STOP_TIMEOUT = 5.0  # seconds until the robot is killed
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -43,10 +42,10 @@ def run(settings: Settings) -> int:
     """Run broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
     if not any(listener.is_mqtts for listener in settings.broker.listeners):
         raise DemoError("the demo needs a listener with tls: true")
-    if not any(route.ros == ODOMETRY for route in settings.bridge.topics):
+    if not settings.bridge.topics:
         raise DemoError(
-            f"{settings.file} has no route for the demo robot's topics, such as {ODOMETRY}: in a "
-            "folder of its own, `appliance init --demo` writes a configuration that has"
+            f"{settings.file} has no route for the demo robot's topics, such as /odom: in a folder "
+            "of its own, `appliance init --demo` writes a configuration that has"
         )
     with contextlib.suppress(ControlError):
         pid = ask(settings.control, "status")["pid"]

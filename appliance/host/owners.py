@@ -58,6 +58,9 @@ def acting_for(*paths: Path | None) -> Iterator[None]:
     if uid == _ROOT:
         owners = (owner_of(path) for path in paths if path is not None)
         uid = next((owner for owner in owners if owner != _ROOT), _ROOT)
+    if uid == os.geteuid():
+        yield
+        return
     try:
         user = pwd.getpwuid(uid)
     except KeyError:  # of a container, or of a disk from elsewhere

@@ -262,8 +262,7 @@ def initialise(
     yield from _certificates(settings, names)
     calls = "".join(f"topic write {topic}\n" for topic in call_topics(settings.bridge))
     rules = ACCESS.format(user=user) + (first.user_rules if first else "")
-    made = _write_rules(settings.broker.acl, rules, calls or NO_CALLS)
-    yield InitStep(settings.broker.acl, made, "access rules")
+    yield from _rules(settings.broker.acl, rules, calls or NO_CALLS)
     if first is not None:
         yield from _link(settings, file, first)
     # The users come last, so that the password is the last thing shown.
@@ -329,13 +328,19 @@ def _filter(part: str) -> str:
     return "+" if "*" in part else part
 
 
-def _write_rules(path: Path, rules: str, calls: str) -> bool:
-    """Write the access rules, unless there are some already, and the groups that they include."""
-    folder = path.parent / "groups"
-    if not path.exists() or "include groups/" in path.read_text(errors="replace"):
-        for name, text in GROUPS.items():
-            write_new(folder / name, text.format(calls=calls))
-    return write_new(path, rules)
+def _rules(path: Path, rules: str, calls: str) -> Iterator[InitStep]:
+    """Write the groups and the access rules; to rules that are there already, groups that they
+    include and that are missing."""
+    there = path.exists()
+    found = rules if not there else ""
+    with contextlib.suppress(OSError):  # of rules that cannot be read, others see to the groups
+        found = path.read_text(errors="replace")
+    for name, text in GROUPS.items():
+        group = path.parent / "groups" / name
+        made = "include groups/" in found and write_new(group, text.format(calls=calls))
+        if made and there:
+            yield InitStep(group, made, "a group that the access rules include")
+    yield InitStep(path, write_new(path, rules), "access rules")
 
 
 def _certificates(settings: config.Settings, more_names: Sequence[str]) -> Iterator[InitStep]:

@@ -8,7 +8,6 @@ emulated: one of this computer's kind that makes code for the other is many time
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 #: Debian's names of the kinds of computers that there are executables for.
@@ -43,8 +42,6 @@ def prefix(machine: str) -> list[str]:
 
 def missing(machine: str) -> list[str]:
     """Debian's packages that emulation of it needs and this computer lacks."""
-    if not is_foreign(machine):
+    if not is_foreign(machine) or (RULES / f"qemu-{machine}.conf").exists():
         return []
-    rule = RULES / f"qemu-{machine}.conf"
-    lacking = [] if rule.exists() else ["qemu-user-static"]
-    return lacking if shutil.which("unshare") else [*lacking, "util-linux"]
+    return ["qemu-user-static"]

@@ -123,7 +123,7 @@ class Release:
     def _use(
         self, command: Path, house: Path, version: str, within: Sequence[str | Path] = ()
     ) -> None:
-        """Run the command of what was built, in a folder of its own; by another command."""
+        """Run the command of what was built, in a folder of its own; `within` runs it in a root."""
         told = self._run(*within, command, "--version", cwd=house).strip()
         if told != version:
             raise ReleaseError(f"{command} says that it is {told!r}, which ought to be {version!r}")

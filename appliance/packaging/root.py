@@ -128,6 +128,8 @@ class Root:
         versions = self._fetch_sources()
         of_debian = [SUITE, self._mirror, self._machine, *self._packages()]
         of_python = [*of_debian, *versions, f"{self._optimized}", PYTHON_RECIPE.read_text()]
+        if (self._cache / OUTDATED).exists():
+            remove(self._root)  # perhaps there are some now
         self._make(self._root, of_debian, self._make_root)
         self._make(self._local, of_python, self._make_python)
         source = self._copy_project()

@@ -216,12 +216,15 @@ def test_a_group_that_is_missing_is_made_where_groups_are_used(tmp_path: Path) -
     viewers = tmp_path / "groups/viewers.conf"
     content = viewers.read_bytes()
     viewers.unlink()
-    assert made(list(initialise(tmp_path))) == set()
+    assert made(list(initialise(tmp_path))) == {"viewers.conf"}
     assert viewers.read_bytes() == content and (tmp_path / "acl.conf").read_bytes() == rules
     (tmp_path / "acl.conf").write_text("user operator\ntopic readwrite #\n")
     viewers.unlink()
     list(initialise(tmp_path))
     assert not viewers.exists()
+    (tmp_path / "acl.conf").unlink()
+    (tmp_path / "acl.conf").mkdir()  # as good as one that may not be read
+    assert made(list(initialise(tmp_path))) == set()
 
 
 PROJECT = Path(__file__).parents[2]
