@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from appliance.packaging import emulation, root, wheels
+from appliance.packaging import emulation, image, root, wheels
 
 PROJECT = Path(__file__).resolve().parents[2]
 WORK = PROJECT / "build/release"
@@ -69,6 +69,8 @@ class Release:
         for machine in machines:
             with self._step(f"one file and Debian package for {machine}"):
                 self._one_file(version, machine)
+            with self._step(f"image of a container for {machine}"):
+                self._image(version, machine)
             with self._step("bill of materials of the one file (CycloneDX)"):
                 self._bill(version, machine)
         with self._step("checks"):
@@ -151,6 +153,18 @@ class Release:
         self._run("dpkg-deb", "--info", package, cwd=made)
         shutil.move(made / "appliance", self.out / f"appliance-{version}-linux-{machine}")
         shutil.move(package, self.out)
+
+    def _image(self, version: str, machine: str) -> None:
+        """Build the container's image of the wheel for its Python, and use it once."""
+        (wheel,) = self.out.glob(f"*-cp{image.PYTHON.replace('.', '')}-*_{machine}.whl")
+        built = image.Image(machine, version, self._work / f"image-{machine}", self._run)
+        built.build(wheel, self._source)
+        # A `.tar.gz` here is an sdist, to whoever takes files to an index.
+        file = built.save(self.out / f"appliance-{version}-image-{machine}.tgz")
+        self._use(
+            Path("appliance"), self._work, f"appliance {version}, compiled", built.container()
+        )
+        self._say(file.name)
 
     def _bill(self, version: str, machine: str) -> None:
         """Of the packages in the environment of the build, whichever computer its Python is of."""
@@ -284,6 +298,7 @@ def main() -> int:
         pythons = [wheels.Python.at(each) for each in options.python] or wheels.pythons_here()
         if not pythons:
             raise ReleaseError("no Python here has its headers: apt install python3-dev")
+        image.check(python.name for python in pythons)
         if WORK.exists():
             shutil.rmtree(WORK)
         WORK.mkdir(parents=True)
@@ -292,7 +307,7 @@ def main() -> int:
         out.mkdir(parents=True, exist_ok=True)
         for path in release.out.iterdir():  # only now: there are all of them, or none
             shutil.move(path, out)
-    except (ReleaseError, wheels.WheelError, root.BuildError) as error:
+    except (ReleaseError, image.ImageError, wheels.WheelError, root.BuildError) as error:
         print(f"release: {error}", file=sys.stderr)
         return 1
     return 0

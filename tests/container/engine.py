@@ -23,6 +23,8 @@ from typing import Any
 import psutil
 from waiting import eventually
 
+from appliance.packaging import image
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -35,9 +37,6 @@ DOCKERFILE = PROJECT / "appliance/packaging/container/Dockerfile"
 PROGRAMS = ("buildah", "podman", "runc", "mmdebstrap", "ip", "mosquitto_pub")
 PACKAGES = "buildah podman runc mmdebstrap iproute2 mosquitto-clients"
 
-#: Where the image's Python is that of this Debian.
-DEBIAN = "bookworm"
-DEBIAN_PYTHON = "3.11"
 BASE = "localhost/base"
 
 #: What the base has, so that building an image installs little on top.
@@ -181,7 +180,7 @@ class Engine:
                     "--dpkgopt=path-exclude=/usr/share/doc/*",
                     "--dpkgopt=path-exclude=/usr/share/man/*",
                 ),
-                *("--dpkgopt=path-exclude=/usr/share/locale/*", DEBIAN, context / "base.tar"),
+                *("--dpkgopt=path-exclude=/usr/share/locale/*", image.SUITE, context / "base.tar"),
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -201,21 +200,12 @@ class Engine:
     def _download(self, extras: Sequence[str], more: Sequence[str]) -> None:
         what = f"{PROJECT}[{','.join(extras)}]" if extras else f"{PROJECT}"
         project = tomllib.loads((PROJECT / "pyproject.toml").read_text())
-        run(
-            [
-                *(
-                    sys.executable,
-                    "-m",
-                    "pip",
-                    "download",
-                    "--quiet",
-                    "--disable-pip-version-check",
-                ),
-                *("--python-version", DEBIAN_PYTHON, "--only-binary", ":all:"),
-                *("--constraint", PROJECT / "constraints.txt", "--dest", self._wheels),
-                *(what, *project["build-system"]["requires"], *more),
-            ],
-            timeout=900,
+        image.fetch(
+            [what, *project["build-system"]["requires"], *more],
+            PROJECT / "constraints.txt",
+            self._wheels,
+            os.uname().machine,
+            lambda *command, cwd: run(command, timeout=900),
         )
 
     def build(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 import re
@@ -16,7 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
-from appliance.packaging import release, wheels
+from appliance.packaging import emulation, image, release, wheels
 
 PROJECT = Path(__file__).parents[2]
 WORKFLOW = PROJECT / ".github/workflows/checks-and-release.yaml"
@@ -244,6 +245,64 @@ def test_the_headers_for_arm64_are_those_of_here_without_what_is_of_x86_64(tmp_p
     assert "#define SIZEOF_LONG 8\n" in done.stdout
     assert "HAVE_GCC_ASM_FOR_X" not in done.stdout
     assert "HAVE_GCC_ASM_FOR_X64 1" in python.header.read_text()
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_the_image_is_made_of_the_wheel_for_its_python(
+    machine: str, made: release.Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which commands are run; that they do it is seen in a release, which takes minutes."""
+    made._clone()
+    ran: list[list[str]] = []
+    run = made._run
+
+    def record(*command: str | Path, cwd: Path, **variables: str) -> str:
+        words = [str(word) for word in command]
+        if words[0] == "git":
+            return run(*command, cwd=cwd, **variables)
+        before = emulation.prefix(machine)
+        if words[: len(before)] == before:
+            words = words[len(before) :]
+        ran.append(words)
+        if "mmdebstrap" in words:
+            Path(words[-1]).touch()
+        if "push" in words:
+            Path(words[-1].split(":")[1]).write_bytes(b"the image")
+        return {"--version": "appliance 1.2.3, compiled\n", "from": "c\n"}.get(words[-1], "c\n")
+
+    monkeypatch.setattr(made, "_run", record)
+    names = [f"x-1.2.3-cp{python}-cp{python}-manylinux_2_17_{machine}.whl" for python in (311, 312)]
+    other = "x-1.2.3-cp311-cp311-manylinux_2_17_riscv64.whl"
+    for name in (*names, other, "x-1.2.3-py3-none-any.whl"):
+        (made.out / name).touch()
+    made._image("1.2.3", machine)
+    packed = (made.out / f"appliance-1.2.3-image-{machine}.tgz").read_bytes()
+    assert gzip.decompress(packed) == b"the image"
+    (fetch,) = (words for words in ran if "download" in words)
+    assert fetch[-1] == f"{made.out}/{names[0]}[{image.EXTRAS[machine]}]"
+    assert f"--platform=manylinux_2_17_{machine}" in fetch and "--python-version=3.11" in fetch
+    (base,) = (words for words in ran if "mmdebstrap" in words)
+    assert f"--architectures={emulation.ARCHITECTURES[machine]}" in base
+    *_, build = (words for words in ran if "bud" in words)
+    assert f"--build-arg=WHEEL=/wheels/{names[0]}" in build
+    moment = git("log", "-1", "--format=%ct", cwd=made._source).strip()
+    assert f"--timestamp={moment}" in build
+    used = [
+        words[words.index("--") + 1 :] for words in ran if "--isolation" in words and "--" in words
+    ]
+    assert used == [
+        ["appliance", *each] for each in (["--version"], ["init", "--robot", "r2d2"], ["check"])
+    ]
+
+
+def test_an_image_needs_a_wheel_and_its_tools(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda tool: f"/bin/{tool}")
+    image.check(["python3.12", "python3.11"])
+    with pytest.raises(image.ImageError, match=r"for Python 3\.11, .*--python python3\.11"):
+        image.check(["python3.12"])
+    monkeypatch.setattr(shutil, "which", lambda tool: None)
+    with pytest.raises(image.ImageError, match="apt install mmdebstrap buildah"):
+        image.check(["python3.11"])
 
 
 def test_the_workflow_is_one(tmp_path: Path) -> None:
