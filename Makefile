@@ -1,6 +1,6 @@
 # make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443
 # make test  every check: format, lint, types, import directions, tests
-# make test-kilted  the tests that tell most about a distribution of ROS 2, on Kilted in place of Jazzy
+# make test-kilted  of these the tests that tell most about a distribution of ROS 2, on Kilted in place of Jazzy
 # make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
 #                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
 # make binary    dist/appliance: one executable with everything in it, for this kind of computer;

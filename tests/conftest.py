@@ -80,6 +80,7 @@ def pytest_timeout_set_timer(settings: Any) -> Generator[None, object, object]:
 #: cores. They go first, or the other workers end up waiting for the last.
 LONG = (
     "test_compiled.py",
+    "test_kilted.py",
     "test_uplink.py",
     "test_journeys.py",
     "test_managing.py",
