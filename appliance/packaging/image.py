@@ -1,4 +1,4 @@
-"""Builds the image of a container, as a file for `docker load` or `podman load`, for a release.
+"""Builds the image of a container, as a file for a release: `gunzip --stdout FILE | docker load`.
 
 The Dockerfile is the one that users have. What it installs is a wheel of the release with machine
 code; nothing is pulled: its base is a Debian made by mmdebstrap, and pip's packages are fetched
