@@ -2,7 +2,7 @@
 
 Everything else about the package is in pyproject.toml. Without the variable nothing is compiled,
 and no compiler is needed; with it pip fetches mypyc for the build, and a C compiler and Python's
-headers must be there. What is compiled does the same in about a third of the CPU time.
+headers must be there. What is compiled takes 10 to 40 % less of the CPU time.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ INTERPRETED = {
     Path("appliance/mqtt/connect.py"),
     Path("appliance/mqtt/packets.py"),
 }
+
+# Of the store: what runs for every message that is stored, and for every row at the start.
+STORE = ("loader", "messages", "rows")
 
 # Of the link to a fleet's broker: what runs for every message of its backlog, and what that calls.
 UPSTREAM = (
@@ -72,9 +75,12 @@ def extensions() -> list[Extension]:
         )
     modules = {*Path("appliance/mqtt").glob("*.py"), *Path("appliance/broker").glob("*.py")}
     modules |= {Path(f"appliance/net/{name}.py") for name in ("connection", "scheduler", "tls")}
+    modules |= {Path(f"appliance/store/{name}.py") for name in STORE}
     modules |= {Path(f"appliance/upstream/{name}.py") for name in UPSTREAM}
     modules = {module for module in modules if module.name != "__init__.py"} - INTERPRETED
     level = os.environ.get("APPLIANCE_OPTIMIZE", "3")
+    if level not in ("0", "1", "2", "3"):
+        sys.exit(f"setup.py: APPLIANCE_OPTIMIZE is the C compiler's -O, 0 to 3, and not {level!r}")
     compiled = mypycify(sorted(map(str, modules)), opt_level=level, group_name="appliance")
     # In a generated file of 40 MB gcc looks two minutes for indentation that could mislead.
     options = ["-Wno-misleading-indentation"]

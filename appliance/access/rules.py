@@ -293,7 +293,10 @@ class _AclReader:
         try:
             check_filter(filter)
         except ValueError as error:
-            raise _LineError(column, f"{filter!r}: {error}") from None
+            text = f"{filter!r}: {error}"
+            if " #" in filter:
+                text += "; a comment needs a line of its own"
+            raise _LineError(column, text) from None
         return permission, filter
 
 

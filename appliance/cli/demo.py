@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import ctypes
 import importlib.util
+import os
 import shlex
 import signal
 import socket
@@ -42,7 +43,7 @@ def run(settings: Settings) -> int:
     """Run broker, bridge and demo robot until SIGINT or SIGTERM; returns the exit code."""
     if not any(listener.is_mqtts for listener in settings.broker.listeners):
         raise DemoError("the demo needs a listener with tls: true")
-    if not settings.bridge.topics:
+    if not any(route.is_pattern or route.ros == "/odom" for route in settings.bridge.topics):
         raise DemoError(
             f"{settings.file} has no route for the demo robot's topics, such as /odom: in a folder "
             "of its own, `appliance init --demo` writes a configuration that has"
@@ -52,7 +53,7 @@ def run(settings: Settings) -> int:
         raise DemoError(f"this demo runs already, as process {pid}; Ctrl-C in its terminal ends it")
     for listener in settings.broker.listeners:
         if listener.bind.path is None:
-            _check_free(listener.bind)
+            _check_free(listener.bind, settings.file)
     uvloop.run(_main(settings))
     return 0
 
@@ -78,7 +79,7 @@ class Demo(App):
         listening = list(zip(self.settings.broker.listeners, self.addresses, strict=True))
         mqtts = next(address for listener, address in listening if listener.is_mqtts)
         web = [address for listener, address in listening if listener.is_web_over_tls]
-        _say(instructions(self.settings, mqtts, *web[:1]))
+        _say(instructions(self.settings, mqtts, *web[:1], has_robot=self._robot is not None))
 
     async def stop(self) -> None:
         """Stop the robot, then the appliance; may be called twice."""
@@ -89,17 +90,19 @@ class Demo(App):
         await super().stop()
 
 
-def _check_free(bind: Bind) -> None:
+def _check_free(bind: Bind, file: Path | None) -> None:
     family = socket.AF_INET6 if ":" in bind.host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind((bind.host, bind.port))
         except OSError as error:
+            others = f"other ports in broker.listeners of {file}"
+            if "APPLIANCE_PLAIN_PORT" in os.environ:  # as the Makefile sets it
+                others = "other ports: make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443"
             raise DemoError(
                 f"{bind} cannot be used: {(error.strerror or str(error)).lower()}. Another program "
-                "may run there; choose other ports: "
-                "make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443"
+                f"may run there: stop it, or choose {others}"
             ) from None
 
 
@@ -108,8 +111,8 @@ async def _start_robot(settings: Settings) -> Process | None:
         return None
     if importlib.util.find_spec("rclpy") is None:
         _say(
-            "There is no ROS 2 here (its packages on PyPI are for Linux on x86-64), so there is no "
-            "demo robot: the broker runs alone."
+            "There is no ROS 2 here, so there is no demo robot: the broker runs alone. Source a "
+            "ROS 2, or, on x86-64 Linux, install the appliance with its extra [ros]."
         )
         return None
     libc = ctypes.CDLL(None)  # loaded before the fork: after it nothing may be loaded
@@ -139,11 +142,16 @@ async def _stop(robot: Process) -> None:
 
 
 def instructions(
-    settings: Settings, mqtts: tuple[str, int], web: tuple[str, int] | None = None
+    settings: Settings,
+    mqtts: tuple[str, int],
+    web: tuple[str, int] | None = None,
+    *,
+    has_robot: bool = True,
 ) -> str:
     """How to see and drive the robot: in a browser, and with commands in another terminal.
 
-    `mqtts` and `web` are the hosts and ports of listeners with TLS.
+    `mqtts` and `web` are the hosts and ports of listeners with TLS. Without a robot nobody says
+    anything but the other terminals.
     """
     (host, port), robot = mqtts, settings.robot
     directory = (settings.file or Path("appliance.yaml")).parent
@@ -160,30 +168,40 @@ def instructions(
     if port != 8883:  # the other terminal does not have this one's APPLIANCE_PORT
         options += f" -p {port}"
     options += f" --password-file {_quoted(password)}" if password.exists() else ""
-    call = ""
-    if any(RESET in route.names for route in settings.bridge.services):
+    see, drive, call = (
+        "see the robot",
+        "drive it, for two seconds; it stops when no command follows",
+        "",
+    )
+    if not has_robot:
+        see, drive = "see what is published there", "publish to it, as who drives a robot would"
+    elif any(RESET in route.names for route in settings.bridge.services):
         call = (
             f"put it back to its start, by a service of ROS:\n  {command} call {options} {RESET}\n"
         )
+    topic = f"{robot}/odom" if has_robot else f"{robot}/#"
+    console = _console(web, user, password)
+    if console and has_robot:
+        console += f" Topics has the\nodometry, {robot}/odom, and Drive moves the robot."
     return f"""
-Ready.{_console(web, robot, user, password)}
+Ready.{console}
 
 In another terminal, in this folder:
 
-see the robot:
-  mosquitto_sub {login} -v -t '{robot}/odom'
-drive it, for two seconds; it stops when no command follows:
+{see}:
+  mosquitto_sub {login} -v -t '{topic}'
+{drive}:
   mosquitto_pub {login} -t '{robot}/cmd_vel' {DRIVE}
 
 the same with this project's own command:
-  {command} sub {options} -v '{robot}/odom'
+  {command} sub {options} -v '{topic}'
   {command} pub {options} '{robot}/cmd_vel' -q 0 {DRIVE}
 {call}
 Ctrl-C here ends everything.
 """
 
 
-def _console(web: tuple[str, int] | None, robot: str, user: str, password: Path) -> str:
+def _console(web: tuple[str, int] | None, user: str, password: Path) -> str:
     """Where the console is, and how to sign in; empty without a listener for the web."""
     if web is None:
         return ""
@@ -196,8 +214,7 @@ def _console(web: tuple[str, int] | None, robot: str, user: str, password: Path)
   https://{_here(host)}:{port}/
 {phone}
 Sign in as {user}{kept}.
-The certificate is this robot's own, so the browser asks whether to trust it. Topics has the
-odometry, {robot}/odom, and Drive moves the robot."""
+The certificate is this robot's own, so the browser asks whether to trust it."""
 
 
 def _here(host: str) -> str:

@@ -108,6 +108,12 @@ def run(
     from appliance.app import main as app
     from appliance.ops import logs
 
+    if context.obj and settings.bridge.bus == "ros2":
+        from appliance.ros.ros2.node import fault_of_arguments
+
+        if text := fault_of_arguments(context.obj):
+            raise CommandError(f"ROS arguments (behind --ros-args): {text}")
+
     log = settings.log
     logs.setup(log_level or log.level, log.levels, log_format or log.format)
     with _start_errors():

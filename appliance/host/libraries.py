@@ -23,7 +23,7 @@ _PYTHON = re.compile(r"\.cpython-(\d)(\d+)")
 _ADVICE = (
     "An environment works only with the Python and the kind of computer that it was made with. "
     "Make it here, in the folder of the appliance's sources: "
-    "python3 -m venv ~/appliance && ~/appliance/bin/pip install ."
+    "python3 -m venv ~/appliance-venv && ~/appliance-venv/bin/pip install ."
 )
 
 

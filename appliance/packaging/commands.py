@@ -77,7 +77,8 @@ def _command(command: Any, name: str, parent: Any) -> Command:
         if parameter.param_type_name == "argument":
             arguments.append((called.partition(" ")[0], explained))
             continue
-        words = called.replace(",", "").split()
+        # A flag and its opposite have a stroke between them: `--start / --no-start`.
+        words = called.replace(",", "").replace(" / ", " ").split()
         names = tuple(word for word in words if word.startswith("-"))
         options.append(Option(names, " ".join(words[len(names) :]), explained))
     below = [(each, found) for each, found in getattr(command, "commands", {}).items()]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import gzip
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -59,7 +60,7 @@ def build(command: Path, directory: Path) -> Path:
         made_for = f"is made for {machine}" if machine else "is no executable of Linux"
         raise UnreadableError(f"{command} {made_for}; packages are for {', '.join(ARCHITECTURES)}")
     architecture = ARCHITECTURES[machine]
-    release = version("ros-mqtt-appliance").replace(".dev", "~dev").replace("rc", "~rc")
+    release = debian_version(version("ros-mqtt-appliance"))
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         root.chmod(0o755)
@@ -79,6 +80,11 @@ def build(command: Path, directory: Path) -> Path:
         options = ("--root-owner-group", "-Zgzip", "-z1", "--build")
         subprocess.run(["dpkg-deb", *options, root, package], check=True, stdout=sys.stderr)
     return package
+
+
+def debian_version(version: str) -> str:
+    """A version of Python's (PEP 440) as Debian orders them: what comes before 1.0 has a tilde."""
+    return re.sub(r"(a|b|rc)(?=\d)", r"~\1", version).replace(".dev", "~~dev")
 
 
 def _stage(root: Path, command: Path) -> None:

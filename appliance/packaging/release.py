@@ -94,7 +94,7 @@ class Release:
         if found is None:
             raise ReleaseError('pyproject.toml has no line `version = "…"`')
         tags = self._run(*git, "tag", "--points-at", "HEAD", cwd=PROJECT).split()
-        if wrong := [tag for tag in tags if re.match(r"v\d", tag) and tag != f"v{found[1]}"]:
+        if wrong := [tag for tag in tags if tag.startswith("v") and tag != f"v{found[1]}"]:
             raise ReleaseError(
                 f"the tag {wrong[0]} is not for version {found[1]} of pyproject.toml"
             )
@@ -165,6 +165,7 @@ class Release:
             Path("appliance"), self._work, f"appliance {version}, compiled", built.container()
         )
         self._say(file.name)
+        root.remove(self._work / f"image-{machine}")  # several times as large
 
     def _bill(self, version: str, machine: str) -> None:
         """Of the packages in the environment of the build, whichever computer its Python is of."""
@@ -242,7 +243,7 @@ class Release:
                 raise ReleaseError(f"{error.filename} is not installed here") from None
             log.write(done.stdout)
         if done.returncode:
-            told = self._log.read_text(errors="replace")[begin:].splitlines()
+            told = self._log.read_bytes()[begin:].decode(errors="replace").splitlines()
             last = "\n".join(f"    {line}" for line in told[-SHOWN:])
             name = Path(command[0]).name
             raise ReleaseError(
@@ -279,7 +280,10 @@ def main() -> int:
     os.umask(0o022)
     native = os.uname().machine
     cross = [each for each, compiler in wheels.COMPILERS.items() if shutil.which(compiler)]
-    machines = options.machine or [native, *(each for each in cross if each != native)]
+    machines = [*dict.fromkeys(options.machine)] or [
+        native,
+        *(each for each in cross if each != native),
+    ]
     try:
         out: Path = options.out.absolute()
         if out.exists() and (here := sorted(each.name for each in out.iterdir())):
@@ -294,20 +298,23 @@ def main() -> int:
                     f"there is no compiler for {machine} here: for aarch64 on another computer, "
                     "apt install gcc-aarch64-linux-gnu"
                 )
+            wheels.check_compiler(machine)
             root.check_computer(machine)
-        pythons = [wheels.Python.at(each) for each in options.python] or wheels.pythons_here()
+        named = {(python := wheels.Python.at(each)).name: python for each in options.python}
+        pythons = [*named.values()] or wheels.pythons_here()
         if not pythons:
             raise ReleaseError("no Python here has its headers: apt install python3-dev")
         image.check(python.name for python in pythons)
-        if WORK.exists():
-            shutil.rmtree(WORK)
+        if not (PROJECT / ".git").exists():
+            raise ReleaseError(f"{PROJECT} is no clone: a release is made of a commit of git")
+        root.remove(WORK)
         WORK.mkdir(parents=True)
         release = Release(WORK)
         release.make(pythons, machines)
         out.mkdir(parents=True, exist_ok=True)
         for path in release.out.iterdir():  # only now: there are all of them, or none
             shutil.move(path, out)
-    except (ReleaseError, image.ImageError, wheels.WheelError, root.BuildError) as error:
+    except (ReleaseError, image.ImageError, wheels.WheelError, root.BuildError, OSError) as error:
         print(f"release: {error}", file=sys.stderr)
         return 1
     return 0

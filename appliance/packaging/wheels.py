@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from appliance.packaging import emulation
+
 #: The machine of an ELF file, two bytes at offset 18.
 _MACHINES = {"x86_64": 62, "aarch64": 183}
 #: The compiler of another kind of computer, as Debian calls it: apt install gcc-aarch64-linux-gnu.
@@ -95,6 +97,26 @@ def pythons_here() -> list[Python]:
             continue  # not installed, or a shim of one that is not
         found.setdefault(python.name, python)
     return [found[name] for name in sorted(found, key=lambda name: int(name.partition(".")[2]))]
+
+
+def check_compiler(machine: str) -> None:
+    """Raises WheelError unless there is a compiler for it, with the headers of its C library."""
+    compiler = COMPILERS.get(machine, "cc")
+    package = "gcc" if machine not in COMPILERS else f"gcc-{machine}-linux-gnu"
+    try:
+        tried = subprocess.run(
+            [compiler, "-E", "-"], input=b"#include <limits.h>\n", capture_output=True, check=False
+        )
+    except OSError:
+        raise WheelError(
+            f"there is no compiler for {machine} here: apt install {package}"
+        ) from None
+    if tried.returncode:
+        library = f"libc6-dev-{emulation.ARCHITECTURES[machine]}-cross"
+        raise WheelError(
+            f"{compiler} does not find the C library's headers: apt install "
+            f"{library if machine in COMPILERS else 'libc6-dev'}"
+        )
 
 
 def unpack(sdist: Path, directory: Path) -> Path:
@@ -175,6 +197,8 @@ def build_compiled(
 def _build(executable: Path, variables: dict[str, str], sdist: Path, work: Path, run: Run) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="wheel-", dir=work))
     source = unpack(sdist, folder / "source")
+    # Of a build's own environment too, to which `-c` does not apply.
+    variables = {**variables, "PIP_CONSTRAINT": str(source / "constraints.txt")}
     # By a Python that has nothing installed: the build has to ask for what it needs.
     run(executable, "-m", "venv", folder / "venv", cwd=folder)
     pip = (folder / "venv/bin/python", "-m", "pip", "wheel", "--disable-pip-version-check")

@@ -76,18 +76,18 @@ async def test_what_is_printed_can_be_typed(demo: Path) -> None:
         drive = next(line for line in printed if line.startswith("mosquitto_pub"))
         ours_to_drive = next(line for line in printed if "appliance pub" in line)
         url = next(line for line in printed if line.startswith("https://"))
-        assert any(line.endswith("user.password /reset") for line in printed)
+        assert not any("/reset" in line or "odom" in line for line in printed)  # nobody has them
         ours = next(line for line in printed if "appliance sub" in line)
 
         state = "demo/_appliance/state"
         shell = ["sh", "-c"]
-        once = see.replace("demo/odom", state) + " -C 1 -W 10"
+        once = see.replace("demo/#", state) + " -C 1 -W 10"
         assert await output([*shell, once]) == (0, f"{state} online\n")
         assert await output([*shell, drive]) == (0, "")
         assert await output([*shell, ours_to_drive]) == (0, "")
         assert await asyncio.to_thread(status_of, url, demo / "run/certs/ca.crt") == 200
 
-        words = shlex.split(ours.replace("demo/odom", state))[1:]
+        words = shlex.split(ours.replace("demo/#", state))[1:]
         python = [sys.executable, "-m", "appliance"]
         assert await output([*python, *words, "-C", "1", "-W", "10"]) == (0, f"{state} online\n")
     finally:
@@ -103,6 +103,24 @@ def test_a_port_that_is_taken(demo: Path, monkeypatch: pytest.MonkeyPatch, name:
         settings = config.load(demo / "run/appliance.yaml")
         with pytest.raises(tour.DemoError, match=rf":{port} cannot .* make run PORT=.* WEB_PORT="):
             tour.run(settings)
+        monkeypatch.delenv("APPLIANCE_PLAIN_PORT")
+        monkeypatch.setenv("APPLIANCE_PORT", str(port))
+        if name == "APPLIANCE_PORT":  # by hand, and not by `make run`
+            settings = config.load(demo / "run/appliance.yaml")
+            with pytest.raises(tour.DemoError, match=r"in broker\.listeners of .*appliance\.yaml"):
+                tour.run(settings)
+
+
+def test_with_its_robot_it_says_how_to_see_and_drive_it(demo: Path) -> None:
+    settings = config.load(demo / "run/appliance.yaml")
+    told = tour.instructions(settings, ("0.0.0.0", 8883), ("0.0.0.0", 8443))
+    lines = [line.strip() for line in told.splitlines()]
+    assert any(line.endswith("user.password /reset") for line in lines)
+    assert any(line.startswith("mosquitto_sub") and "-t 'demo/odom'" in line for line in lines)
+    assert any("appliance sub" in line and "-v 'demo/odom'" in line for line in lines)
+    assert "Topics has the\nodometry, demo/odom, and Drive moves the robot." in told
+    alone = tour.instructions(settings, ("0.0.0.0", 8883), ("0.0.0.0", 8443), has_robot=False)
+    assert "odom" not in alone and "/reset" not in alone and "-t 'demo/#'" in alone
 
 
 def test_a_demo_of_before_the_console_has_no_url(demo: Path) -> None:
@@ -151,6 +169,13 @@ def test_a_configuration_that_is_not_the_demos(tmp_path: Path) -> None:
     list(initialise(tmp_path))
     settings = config.load(tmp_path / "appliance.yaml")
     with pytest.raises(tour.DemoError, match=r"no route for .* /odom: .*appliance init --demo"):
+        tour.run(settings)
+    file = tmp_path / "appliance.yaml"
+    others = file.read_text().replace("topics: []\n", "topics: [{ros: /chatter, to: mqtt}]\n")
+    file.write_text(others)
+    settings = config.load(file)
+    assert settings.bridge.topics
+    with pytest.raises(tour.DemoError, match="no route for"):
         tour.run(settings)
 
 

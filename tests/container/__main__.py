@@ -24,7 +24,7 @@ IMAGE = "localhost/appliance"
 MIB = 1 << 20
 
 #: What compiling needs beside the appliance's own dependencies.
-COMPILE_NEEDS = ("async-timeout>=5", "mypy[mypyc]>=2.4", "types-PyYAML>=6.0.12")
+COMPILE_NEEDS = ("async-timeout>=5", "mypy[mypyc]>=2.4", "pydantic>=2.10", "types-PyYAML>=6.0.12")
 
 #: A robot's node: says /chatter, and prints what is said on /said.
 NODE = """

@@ -64,7 +64,7 @@ def test_a_library_that_cannot_be_loaded(
     assert done.stderr.startswith("appliance: ")
     assert f"{package / name}" in done.stderr
     assert said in done.stderr
-    assert "python3 -m venv ~/appliance && ~/appliance/bin/pip install ." in done.stderr
+    assert "python3 -m venv ~/appliance-venv && ~/appliance-venv/bin/pip install ." in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "house").exists()
 

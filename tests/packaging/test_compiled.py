@@ -18,7 +18,13 @@ ROOT = Path(__file__).parents[2]
 
 #: The tests of what is compiled, as far as they run in their own process. Of what is random a few
 #: examples are enough, of what is lengthy none, and of two event loops the appliance's own.
-TESTS = ["tests/broker", "tests/mqtt", "tests/net/test_tls.py", "tests/net/test_websocket.py"]
+TESTS = [
+    "tests/broker",
+    "tests/mqtt",
+    "tests/store",
+    "tests/net/test_tls.py",
+    "tests/net/test_websocket.py",
+]
 UPSTREAM = ("backlog", "backlog_random", "link", "publish_properties", "rates", "records", "uplink")
 TESTS += [f"tests/upstream/test_{name}.py" for name in UPSTREAM]
 

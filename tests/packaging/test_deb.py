@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import itertools
 import os
 import re
 import shlex
@@ -19,7 +20,7 @@ from pages import Page
 
 from appliance.cli import main as cli
 from appliance.packaging import completion, deb, manual
-from appliance.packaging.commands import Command, Option
+from appliance.packaging.commands import Command, Option, tree
 from appliance.packaging.symbols import UnreadableError
 
 PROJECT = Path(__file__).parents[2]
@@ -164,6 +165,21 @@ def test_every_command_and_option_is_in_the_manual(root: Path) -> None:
         missing += [(called, option) for option in options_of(command) - listed]
     assert missing == []
     assert len(pages) == 1 + len(commands()["appliance"].commands)
+
+
+def test_a_flag_takes_no_value() -> None:
+    """Nor does one with an opposite, `--start / --no-start`: completion goes on behind both."""
+    options = [each for command in tree().walk() for each in command.options]
+    assert not [each for each in options if each.value.startswith("-")]
+    opposites = {each.names: each.value for each in options if "--no-start" in each.names}
+    assert opposites == {("--start", "--no-start"): ""}
+
+
+def test_what_comes_before_a_release_is_older_for_debian_too() -> None:
+    versions = ["1.0.dev3", "1.0a1", "1.0b2", "1.0rc1", "1.0", "1.0.1"]
+    for older, newer in itertools.pairwise(map(deb.debian_version, versions)):
+        done = subprocess.run(["dpkg", "--compare-versions", older, "lt", newer])
+        assert done.returncode == 0, (older, newer)
 
 
 def test_a_page_says_what_its_command_says() -> None:

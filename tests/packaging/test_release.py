@@ -67,9 +67,12 @@ def test_what_is_not_committed_is_named(project: Path, made: release.Release) ->
         made._clone()
 
 
-def test_a_tag_of_another_version_is_refused(project: Path, made: release.Release) -> None:
-    git("tag", "v1.2.4", cwd=project)
-    with pytest.raises(release.ReleaseError, match=r"v1\.2\.4 is not for version 1\.2\.3"):
+@pytest.mark.parametrize("tag", ["v1.2.4", "vnext", "v-1.2.3"])
+def test_a_tag_of_another_version_is_refused(
+    project: Path, made: release.Release, tag: str
+) -> None:
+    git("tag", tag, cwd=project)
+    with pytest.raises(release.ReleaseError, match=f"{tag} is not for version 1.2.3"):
         made._clone()
 
 
@@ -109,7 +112,7 @@ def test_an_sdist_that_is_not_the_repository_is_refused(
 
 
 def test_a_command_that_fails_is_shown_with_its_last_lines(made: release.Release) -> None:
-    made._run("echo", "from a step before", cwd=made._work)
+    made._run("echo", f"{'×' * 5000} from a step before", cwd=made._work)
     script = "for n in $(seq 100); do echo line $n; done; echo why >&2; exit 3"
     with pytest.raises(release.ReleaseError) as raised:
         made._run("sh", "-c", script, cwd=made._work)
@@ -293,6 +296,19 @@ def test_the_image_is_made_of_the_wheel_for_its_python(
     assert used == [
         ["appliance", *each] for each in (["--version"], ["init", "--robot", "r2d2"], ["check"])
     ]
+
+
+def test_a_compiler_has_its_c_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler = tmp_path / "aarch64-linux-gnu-gcc"
+    compiler.write_text("#!/bin/sh\nexit 1\n")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(wheels.WheelError, match="apt install gcc-aarch64-linux-gnu"):
+        wheels.check_compiler("aarch64")
+    compiler.chmod(0o755)
+    with pytest.raises(wheels.WheelError, match="headers: apt install libc6-dev-arm64-cross"):
+        wheels.check_compiler("aarch64")
+    compiler.write_text("#!/bin/sh\n")
+    wheels.check_compiler("aarch64")
 
 
 def test_an_image_needs_a_wheel_and_its_tools(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -221,7 +221,7 @@ def test_the_command_is_found(tmp_path):
         return path
 
     own, first, second = command("own"), command("first"), command("second")
-    at_home, named = command("home/appliance/bin"), command("named")
+    at_home, named = command("home/appliance-venv/bin"), command("named")
     (tmp_path / "none/appliance").mkdir(parents=True)  # a folder of that name is no command
     paths = [str(tmp_path / name) for name in ("none", "own", "first", "second")]
     environment = {"PATH": os.pathsep.join(["", *paths]), "HOME": str(tmp_path / "home")}

@@ -33,6 +33,7 @@ from appliance.mqtt.packets import (
     Unsubscribe,
     Will,
 )
+from appliance.mqtt.reason import ReasonCode
 from appliance.store.inspection import summarise
 from store.harness import Harness, difference, state
 
@@ -251,7 +252,7 @@ async def test_a_clean_stop_saves_sessions_without_wills(harness: Harness, tmp_p
     watcher = await harness.join("watcher", **lasting(5))
     watcher.send(Subscribe(1, [Subscription("will", 1)]))
     await harness.join("client", will=Will("will", b"", 1), **lasting(5))
-    harness.broker.close(lambda session: session.close_link(0x8B, ""))  # type: ignore[arg-type]
+    harness.broker.close(lambda session: session.close_link(ReasonCode.SERVER_SHUTTING_DOWN, ""))
     twin = await restarted(harness, tmp_path / "twin")
     twin.tick(1)
     assert set(twin.broker.sessions) == {"watcher", "client"}

@@ -173,7 +173,7 @@ def _advice(source: str, sourced: Sourced | None, choice: str | None) -> str:
         return (
             "there is no ROS 2 here: rclpy cannot be imported. Source a ROS 2 setup file first, "
             "or, on x86-64 Linux, install the appliance with one: pip install '.[ros]' in the "
-            "folder of its sources"
+            "folder of its sources, or pip install 'FILE.whl[ros]' where it came as a wheel"
         )
     return ""
 

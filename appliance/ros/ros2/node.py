@@ -693,6 +693,35 @@ def import_service(name: str) -> Any:
     return service
 
 
+def fault_of_arguments(arguments: Sequence[str]) -> str | None:
+    """What ROS has against its own arguments, those behind `--ros-args`; None if nothing, or where
+    there is no ROS that could be asked.
+
+    What only a node can tell, such as a value of another type than its parameter, is not seen.
+    """
+    try:
+        error = _refusal(["--ros-args", *arguments])
+    except ImportError:
+        return None
+    if error is None or _refusal([]) is not None:  # it is not for the arguments
+        return None
+    text = re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split()))  # places in rcl's sources
+    text = text.removeprefix("failed to initialize rcl: ")
+    return f"unknown: {text}" if type(error).__name__ == "UnknownROSArgsError" else text
+
+
+def _refusal(arguments: list[str]) -> Exception | None:
+    from rclpy.context import Context
+
+    tried = Context()
+    try:
+        tried.init(args=arguments, initialize_logging=False)
+    except Exception as error:
+        return error
+    tried.try_shutdown()
+    return None
+
+
 def _error_text(error: Exception) -> str:
     if "have the security libraries" in str(error):
         return (

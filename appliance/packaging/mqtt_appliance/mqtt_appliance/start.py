@@ -22,6 +22,7 @@ PLACES = (
     "/usr/bin/appliance",
     "/usr/local/bin/appliance",
     "/opt/appliance/bin/appliance",
+    "~/appliance-venv/bin/appliance",
     "~/appliance/bin/appliance",
 )
 
@@ -30,7 +31,7 @@ mqtt_appliance: the appliance is not installed, and this package only starts it.
 There is no command `appliance` in PATH, nor {places}.
 Install it in the folder of its sources, which this package is from, in one of these ways:
 
-  {python} -m venv --system-site-packages ~/appliance && ~/appliance/bin/pip install .
+  {python} -m venv --system-site-packages ~/appliance-venv && ~/appliance-venv/bin/pip install .
   make deb && sudo apt install ./dist/appliance_*.deb
 
 Or say where it is: {variable}=/path/to/appliance"""
