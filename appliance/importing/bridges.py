@@ -106,7 +106,7 @@ def _hosts(bridge: Bridge) -> list[tuple[str, int]]:
     hosts = []
     for word in words(statement.value):
         host, colon, port = word.rpartition(":")
-        if not colon:
+        if not colon or word.endswith("]"):  # a name, an IPv4 address, or [::1]
             host, port = word, str(_PORT)
         if not re.fullmatch(r"[0-9]{1,5}", port) or not 1 <= int(port) <= 65535 or not host:
             raise ImportProblemsError([(statement.place, "address is HOST or HOST:PORT")])
@@ -207,7 +207,7 @@ def _tls(bridge: Bridge, directory: Path, notes: Notes) -> dict[str, Any]:
         statement = bridge.get(option)
         if statement is None:
             continue
-        path = locate(statement.value, directory)
+        path = locate(statement, directory)
         if path is None or not path.is_file():
             text = f"there is no file {statement.value} here that can be read: put it there, and "
             text += f"name it as tls.{key} of the link"

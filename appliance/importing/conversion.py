@@ -51,8 +51,9 @@ def import_mosquitto(path: Path, robot: str) -> Imported:
     Raises ImportProblemsError when the configuration has mistakes, which it lists.
     """
     notes = Notes()
-    statements = Reader(path, notes).read()
-    configuration = assemble(statements, path.name, notes)
+    reader = Reader(path, notes)
+    configuration = assemble(reader.read(), path.name, notes)
+    configuration.is_incomplete = reader.missing
     directory = path.parent
     blocks: list[Block] = [
         configuration.general,
@@ -79,7 +80,7 @@ def import_mosquitto(path: Path, robot: str) -> Imported:
     }
     parts = {
         "tls": listeners.tls(kept, directory, notes),
-        "limits": limits.limits(configuration, notes),
+        "limits": limits.limits(configuration, kept, notes),
         "store": limits.store(configuration, notes),
         "log": limits.log(configuration, notes),
     }
@@ -109,7 +110,7 @@ def _text(name: str, settings: dict[str, Any]) -> str:
     text = yaml.safe_dump(
         settings, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
     )
-    return _HEAD.format(name=name) + text
+    return _HEAD.format(name=name if name.isprintable() else repr(name)) + text
 
 
 def _sorted(notes: Notes) -> tuple[Note, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 from appliance.broker.limits import USUAL_PACKET_SIZE
 from appliance.config import format_duration, format_size
 from appliance.config.settings import PACKET_SIZE_MAX
-from appliance.importing.model import Configuration
+from appliance.importing.model import Configuration, Listener
 from appliance.importing.notes import Notes
 from appliance.importing.reading import Statement
 
@@ -24,13 +24,14 @@ _UNITS = {"s": 1, "h": 3600, "d": 86_400, "w": 7 * 86_400, "m": 30 * 86_400, "y"
 _BOUNDED = "0 is no limit there, and here everything that waits is bounded: it is left at {}"
 
 
-def limits(configuration: Configuration, notes: Notes) -> dict[str, Any]:
-    """The section `broker.limits`."""
+def limits(configuration: Configuration, listeners: list[Listener], notes: Notes) -> dict[str, Any]:
+    """The section `broker.limits`, for these of its listeners."""
     found: dict[str, Any] = {}
-    for statement in configuration.general.statements:
+    last = {statement.name: statement for statement in configuration.general.statements}
+    for statement in last.values():
         _limit(statement, found, notes)
-    _connections(configuration, found, notes)
-    aliases = [each for block in configuration.listeners for each in block.named("max_topic_alias")]
+    _connections(configuration, listeners, found, notes)
+    aliases = [each for block in listeners if (each := block.get("max_topic_alias")) is not None]
     if aliases:
         found["topic_alias"] = min(max(max(each.number for each in aliases), 0), 65535)
         if len({each.number for each in aliases}) > 1:
@@ -89,8 +90,10 @@ def _expiry(statement: Statement, found: dict[str, Any], notes: Notes) -> None:
     found["session_expiry"] = format_duration(seconds)
 
 
-def _connections(configuration: Configuration, found: dict[str, Any], notes: Notes) -> None:
-    each = [listener.get("max_connections") for listener in configuration.listeners]
+def _connections(
+    configuration: Configuration, listeners: list[Listener], found: dict[str, Any], notes: Notes
+) -> None:
+    each = [listener.get("max_connections") for listener in listeners]
     wanted = [one for one in each if one is not None and one.number > 0]
     whole = configuration.general.get("global_max_connections")
     if whole is not None and whole.number > 0:

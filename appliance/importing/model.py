@@ -86,6 +86,8 @@ class Configuration:
     bridges: list[Bridge]
     per_listener: bool
     local_only: bool
+    #: Some of it is not here, and may have said who is let in.
+    is_incomplete: bool = False
 
     def security(self, listener: Listener) -> Block:
         """Where the options of access of that listener are."""
@@ -93,6 +95,8 @@ class Configuration:
 
     def is_anonymous(self, listener: Listener) -> bool:
         """Whether that listener lets in clients without a user name."""
+        if self.is_incomplete:
+            return False
         own = listener.get("listener_allow_anonymous")
         if own is not None:
             return own.flag
@@ -138,6 +142,9 @@ class _Sorter:
         elif name == "per_listener_settings":
             if statement.flag and self._is_security_seen and not self._per_listener:
                 self._problems.append((place, f"{name} has to be before all options of access"))
+            if self._per_listener and not statement.flag:
+                text = f"{name} is true before: what is between would count for other listeners"
+                self._problems.append((place, text))
             self._per_listener = self._per_listener or statement.flag
             self._general.statements.append(statement)
         elif option.scope == "bridge":

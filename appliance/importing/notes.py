@@ -45,7 +45,8 @@ class ImportProblemsError(Exception):
     """Nothing was imported; the message has a line for each mistake."""
 
     def __init__(self, problems: list[tuple[Place, str]]) -> None:
-        """A list that is longer than anybody reads is cut."""
+        """A list that is longer than anybody reads is cut, in the message."""
+        self.problems = problems
         lines = [_short(f"{place}: {text}") for place, text in problems[:_MAX_PROBLEMS]]
         if len(problems) > _MAX_PROBLEMS:
             lines.append(f"and {len(problems) - _MAX_PROBLEMS} more")

@@ -38,18 +38,28 @@ class Statement:
         return int(self.value)
 
 
-def locate(named: str, directory: Path) -> Path | None:
-    """The file or folder of that name, relative to `directory`; None if there is none.
+def locate(statement: Statement, directory: Path) -> Path | None:
+    """The file or folder that it names, relative to `directory`; None if there is none.
 
     A configuration that was copied from another computer or out of a container has paths of there:
-    then it is what lies beside the configuration by the end of its path.
+    then it is what lies beside the configuration by the end of its path. Raises
+    ImportProblemsError where this computer has one under the path as well: taken for the other,
+    the rules would be those of somebody else, or none.
     """
-    path = Path(named)
-    if _exists(whole := directory / path):
-        return whole
+    path = Path(statement.value)
+    whole = directory / path
     parts = path.parts[1:]
     ends = (directory.joinpath(*parts[start:]) for start in range(len(parts)))
-    return next((end for end in ends if _exists(end)), None)
+    beside = next((end for end in ends if _exists(end)), None)
+    if not _exists(whole):
+        return beside
+    if beside is None or whole.is_relative_to(directory) or whole.samefile(beside):
+        return whole
+    text = (
+        f"{statement.name} names {whole}, which this computer has, and beside the configuration "
+        f"there is {beside}: write the path of the one that is meant"
+    )
+    raise ImportProblemsError([(statement.place, text)])
 
 
 def _exists(path: Path) -> bool:
@@ -58,6 +68,14 @@ def _exists(path: Path) -> bool:
         return path.exists()
     except OSError:
         return False
+
+
+def _resolved(path: Path) -> Path:
+    """The file that it is; itself where its links lead nowhere, which reading it will tell."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):  # RuntimeError: a circle, before Python 3.13
+        return path.absolute()
 
 
 def _is_binary(path: Path) -> bool:
@@ -79,6 +97,8 @@ class Reader:
         self.directory = main.parent
         self.statements: list[Statement] = []
         self.problems: list[tuple[Place, str]] = []
+        #: A folder with more of the configuration is not there.
+        self.missing = False
         self._main = main
         self._notes = notes
         self._included: set[Path] = set()
@@ -142,30 +162,45 @@ class Reader:
             text = "mosquitto 2.0 does not read it here, only in the main file; nor is it read now"
             self._notes.add(place, "include_dir", text)
             return
-        folder = locate(statement.value, self.directory)
-        if folder is None or not folder.is_dir():
-            text = (
-                f"there is no folder {statement.value} here, so what it has is not carried over: "
-                "copy it beside the file, and import into another folder"
-            )
-            self._notes.add(place, "include_dir", text, to_do=True)
+        try:
+            folder = locate(statement, self.directory)
+            if folder is None or not folder.is_dir():
+                self._is_missing(statement)
+                return
+            found = [each for each in folder.iterdir() if each.name.endswith(".conf")]
+        except ImportProblemsError as error:
+            self.problems += error.problems
             return
-        files = sorted(
-            (each for each in folder.iterdir() if each.name.endswith(".conf")),
-            key=lambda each: [(letter.lower(), letter) for letter in each.name],
-        )
-        for file in files:
-            if file.resolve() == self._main.resolve():
+        except OSError as error:
+            self.problems.append((place, f"include_dir cannot be read: {error.strerror}"))
+            return
+        if not found:
+            text = f"{folder} has no file that ends in .conf, so nothing is read from there"
+            self._notes.add(place, "include_dir", text)
+        for file in sorted(
+            found, key=lambda each: [(letter.lower(), letter) for letter in each.name]
+        ):
+            resolved = _resolved(file)
+            if resolved == self._main.resolve():
                 text = f"has {file.name} in it, which would include itself: move that file"
                 self.problems.append((place, f"include_dir {text}"))
-            elif file.resolve() in self._included:
+            elif resolved in self._included:
                 self.problems.append((place, f"{self._name(file)} is included a second time"))
             elif len(self._included) >= _MAX_FILES:
                 self.problems.append((place, f"include_dir has more than {_MAX_FILES} files"))
                 return
             else:
-                self._included.add(file.resolve())
+                self._included.add(resolved)
                 self._read(file, is_main=False)
+
+    def _is_missing(self, statement: Statement) -> None:
+        self.missing = True
+        text = (
+            f"there is no folder {statement.value} here, so what it has is not carried over: copy "
+            "it beside the file, and import into another folder. As it may have said who is let "
+            "in, no anonymous client is, and without an acl_file nothing is allowed"
+        )
+        self._notes.add(statement.place, "include_dir", text, to_do=True)
 
     def _name(self, path: Path) -> str:
         try:

@@ -9,9 +9,11 @@ from pathlib import Path
 from appliance.access import AccessFileError, Acl
 from appliance.importing.notes import ImportProblemsError, Notes, Place
 
+#: As both brokers read a line: spaces between the words, and any blanks around the filter.
+_BLANK = " \t\n\v\f\r"
 _CLAUSE = re.compile(
-    r"(?P<head> *(?P<keyword>topic|pattern) +(?:(?P<access>read|write|readwrite|deny) +)?)"
-    r"(?P<filter>\S.*)"
+    r"(?P<head> *(?P<keyword>topic|pattern) +(?:(?P<access>read|write|readwrite|deny) +)?"
+    rf"[{_BLANK}]*)(?P<filter>[^{_BLANK}].*)"
 )
 _NAMES = ("%c", "%u")
 _ROBOT = "{robot}"  # which is replaced here
@@ -21,7 +23,7 @@ def carry_over(text: str, name: str, notes: Notes) -> str:
     """The rules as they mean the same here, line by line. Raises ImportProblemsError."""
     lines = []
     for number, line in enumerate(_lines(text), 1):
-        if line.split(" ", 1)[0] == "include":
+        if line.split()[:1] == ["include"]:
             problem = "mosquitto's rules have no `include`"
             raise ImportProblemsError([(Place(name, number), problem)])
         lines.append(_carried(line, Place(name, number), notes))
@@ -49,7 +51,7 @@ def _check(text: str, name: str) -> None:
 
 
 def _carried(line: str, place: Place, notes: Notes) -> str:
-    found = _CLAUSE.fullmatch(line.rstrip())
+    found = _CLAUSE.fullmatch(line.rstrip(_BLANK))
     if found is None:
         return line
     levels = found["filter"].split("/")
@@ -65,6 +67,9 @@ def _carried(line: str, place: Place, notes: Notes) -> str:
         text = f"is left out: {odd[0]!r} {what}; write what is meant for each client"
         notes.add(place, line.strip(), text, to_do=True)
         return f"# {line}"
+    if levels[0] in odd and levels[0].startswith("$"):  # + stands for no such level
+        problem = f"{line.strip()}: {odd[0]!r} {what}; write what is denied to each client"
+        raise ImportProblemsError([(place, problem)])
     text = f"denies more than it did: {odd[0]!r} {what}, and all that can be there is meant"
     notes.add(place, line.strip(), text, to_do=True)
     return found["head"] + "/".join("+" if level in odd else level for level in levels)

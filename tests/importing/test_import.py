@@ -312,6 +312,22 @@ def test_listeners_with_other_rules_let_nobody_in_by_mistake(tmp_path: Path) -> 
     assert "mosquitto.conf:8: password_file: listener 1884 is left out" in told(found)
 
 
+def test_anonymous_clients_have_the_rules_of_no_other_listener(tmp_path: Path) -> None:
+    text = (
+        "per_listener_settings true\nlistener 1883\nallow_anonymous true\nacl_file one\n"
+        "listener 1884\nallow_anonymous true\n"
+    )
+    found = convert(tmp_path, text, one="topic read a\n")
+    assert not may(acl(found, tmp_path), None, Action.PUBLISH, "r2d2/cmd_vel")
+    assert may(acl(found, tmp_path), None, Action.RECEIVE, "a")
+    broker = settings(found)["broker"]
+    terms = {
+        each["bind"]: each.get("anonymous", broker.get("anonymous")) for each in broker["listeners"]
+    }
+    assert terms[":1883"] and not terms[":1884"]
+    assert "it lets none in" in told(found)
+
+
 @pytest.mark.parametrize(
     ("first", "second"),
     [
@@ -358,11 +374,21 @@ def test_the_user_of_a_link_is_nobody_elses(tmp_path: Path) -> None:
 
 
 def test_rules_on_control_are_left_out(tmp_path: Path) -> None:
-    acl = "user admin\ntopic readwrite $CONTROL/#\ntopic read a\npattern write $CONTROL/%u\n"
-    found = convert(tmp_path, "listener 1883\nacl_file acl\n", acl=acl)
+    lines = "user admin\ntopic readwrite $CONTROL/#\ntopic read a\npattern write $CONTROL/%u\n"
+    found = convert(tmp_path, "listener 1883\nacl_file acl\n", acl=lines)
     kept = [line for line in file(found, "acl.conf").splitlines() if not line.startswith("#")]
     assert [line for line in kept if line] == ["user admin", "topic read a"]
     assert "acl:2: topic readwrite $CONTROL/#: is left out" in told(found)
+    for blank in "\t\v\f":
+        line = f"topic readwrite {blank}$CONTROL/#"
+        found = convert(tmp_path, "listener 1883\nacl_file acl\n", acl=f"user a\n{line}\n")
+        assert not may(acl(found, tmp_path), "a", Action.PUBLISH, "$CONTROL/appliance/x")
+
+
+def test_a_denial_that_cannot_be_kept_is_an_error(tmp_path: Path) -> None:
+    lines = "topic readwrite #\npattern deny $x%u/a\n"
+    with pytest.raises(ImportProblemsError, match=r"acl:2: pattern deny .* is no whole level"):
+        convert(tmp_path, "listener 1883\nacl_file acl\n", acl=lines)
 
 
 @pytest.mark.parametrize(
@@ -373,6 +399,9 @@ def test_rules_on_control_are_left_out(tmp_path: Path) -> None:
         ("topic read {robot}/a", None),
         ("pattern deny dev-%u/%c/#", "pattern deny +/%c/#"),
         ("topic deny a/{robot}/b", "topic deny a/+/b"),
+        ("topic deny \ta/{robot}/b", "topic deny \ta/+/b"),
+        ("pattern deny \t a/u%u/b", "pattern deny \t a/+/b"),
+        ("pattern deny \u00a0a%u/b", "pattern deny +/b"),
         ("topic read %u/dev-%c", "topic read %u/dev-%c"),
         ("pattern read %u/%c/#", "pattern read %u/%c/#"),
     ],
@@ -403,6 +432,35 @@ def test_a_listener_at_which_nobody_can_come_in_is_left_out(tmp_path: Path) -> N
 
 
 # General options
+
+
+@pytest.mark.parametrize(
+    ("option", "key"),
+    [
+        ("max_queued_messages", "queue_messages"),
+        ("max_queued_bytes", "queue_bytes"),
+        ("message_size_limit", "payload_size"),
+        ("max_keepalive", "keep_alive"),
+        ("memory_limit", "memory"),
+        ("global_max_clients", "sessions"),
+    ],
+)
+def test_the_last_value_of_a_limit_counts(tmp_path: Path, option: str, key: str) -> None:
+    twice = f"listener 1883\n{option} 5000\n{option} 6000\n"
+    once = convert(tmp_path, f"listener 1883\n{option} 6000\n")
+    assert settings(convert(tmp_path, twice)) == settings(once)
+    assert key in settings(once)["broker"]["limits"]
+    none = convert(tmp_path, f"listener 1883\n{option} 5000\n{option} 0\n")
+    assert key not in settings(none)["broker"].get("limits", {})
+
+
+def test_limits_of_a_listener_that_is_left_out_do_not_count(tmp_path: Path) -> None:
+    text = (
+        "listener 1883\nmax_connections 5\n"
+        "listener 1884\nmount_point x/\nmax_connections 7\nmax_topic_alias 100\n"
+    )
+    limits = settings(convert(tmp_path, text))["broker"]["limits"]
+    assert limits == {"connections": 5}
 
 
 def test_limits_and_the_rest(tmp_path: Path) -> None:
@@ -444,6 +502,55 @@ def test_what_has_no_counterpart_is_told_with_its_line(tmp_path: Path) -> None:
 
 
 # Bridges
+
+
+def test_the_ca_that_counts_is_the_one_of_those_who_ask_for_certificates(tmp_path: Path) -> None:
+    files = dict.fromkeys(("c", "first.pem", "second.pem"), "x")
+    listener = "certfile c\nkeyfile c\n"
+    text = (
+        f"allow_anonymous true\nlistener 8883\n{listener}cafile first.pem\ncrlfile first.pem\n"
+        f"listener 8884\n{listener}cafile second.pem\ncrlfile second.pem\n"
+        "require_certificate true\n"
+    )
+    found = settings(convert(tmp_path, text, **files))["broker"]
+    assert found["tls"]["ca"].endswith("second.pem")
+    assert found["tls"]["crl"].endswith("second.pem")
+
+
+BRIDGE = "listener 1\nconnection c\naddress h\ntopic a out 1\n"
+
+
+def link_of(directory: Path, text: str, **files: str) -> dict[str, Any]:
+    (link,) = settings(convert(directory, text, **files))["upstreams"]
+    return dict(link)
+
+
+def test_a_link_with_any_cas_is_encrypted(tmp_path: Path) -> None:
+    """Or its password would go in plain text."""
+    assert link_of(tmp_path, BRIDGE)["servers"] == ["mqtt://h:1883"]
+    for line in ("bridge_capath /etc/ssl/certs", "bridge_tls_use_os_certs true", "bridge_cafile c"):
+        assert link_of(tmp_path, f"{BRIDGE}{line}\n", c="x")["servers"] == ["mqtts://h:1883"]
+
+
+def test_commands_are_kept_where_the_session_is(tmp_path: Path) -> None:
+    text = "listener 1\nconnection c\naddress [::1]\ntopic a in 1\n"
+    link = link_of(tmp_path, text)
+    assert link["in"][0]["offline"] == "keep" and link["servers"] == ["mqtt://[::1]:1883"]
+    assert "offline" not in link_of(tmp_path, f"{text}cleansession true\n")["in"][0]
+
+
+def test_the_version_of_a_link(tmp_path: Path) -> None:
+    assert "version" not in link_of(tmp_path, BRIDGE)
+    old = f"{BRIDGE}bridge_protocol_version mqttv311\n"
+    assert link_of(tmp_path, old)["version"] == "3.1.1"
+    both = convert(tmp_path, f"{old}topic b in 1\n")
+    assert "version" not in settings(both)["upstreams"][0]
+
+
+def test_a_certificate_and_its_key_go_together(tmp_path: Path) -> None:
+    tls = f"{BRIDGE}bridge_cafile c\nbridge_certfile c\n"
+    assert "certificate" not in link_of(tmp_path, tls, c="x")["tls"]
+    assert {"certificate", "key"} <= {*link_of(tmp_path, f"{tls}bridge_keyfile c\n", c="x")["tls"]}
 
 
 def test_a_bridge_is_a_link(tmp_path: Path) -> None:
@@ -584,6 +691,63 @@ def test_included_files_in_mosquittos_order(tmp_path: Path) -> None:
     found = convert(tmp_path, "include_dir /opt/other/conf.d\nlistener 99\n")
     ports = [each["bind"] for each in settings(found)["broker"]["listeners"]]
     assert ports == [":4", ":2", ":3", ":5", ":1", ":99"]
+
+
+def test_what_this_computer_has_is_not_taken_for_what_lies_beside(tmp_path: Path) -> None:
+    """Of a stock mosquitto here, the empty conf.d would stand for the robot's, which has rules."""
+    here, copy = tmp_path / "etc/mosquitto", tmp_path / "copy"
+    for folder in (here / "conf.d", copy / "conf.d"):
+        folder.mkdir(parents=True)
+    (here / "conf.d/README").touch()
+    (copy / "conf.d/own.conf").write_text("listener 1883\nallow_anonymous false\n")
+    text = f"persistence true\ninclude_dir {here}/conf.d\n"
+    with pytest.raises(ImportProblemsError) as raised:
+        convert(copy, text)
+    assert "mosquitto.conf:2: include_dir names" in str(raised.value)
+    assert f"{here}/conf.d" in str(raised.value) and f"{copy}/conf.d" in str(raised.value)
+    # In its own place it is no question.
+    found = convert(here, text)
+    assert f"{here}/conf.d has no file that ends in .conf" in told(found)
+    for option in ("acl_file", "password_file"):
+        (here / "pw").write_text("alice:x\n")
+        with pytest.raises(ImportProblemsError, match=f"mosquitto.conf:2: {option} names"):
+            convert(copy, f"listener 1883\n{option} {here}/pw\n", pw="")
+    lines = f"listener 8883\ncertfile {here}/c.pem\nkeyfile {here}/c.pem\n"
+    (here / "c.pem").touch()
+    with pytest.raises(ImportProblemsError, match="certfile names"):
+        convert(copy, lines, **{"c.pem": ""})
+
+
+@pytest.mark.parametrize("rest", ["", "allow_anonymous true\nlistener 1883\n"])
+def test_without_a_part_of_the_configuration_nothing_is_open(tmp_path: Path, rest: str) -> None:
+    found = convert(tmp_path, f"{rest}include_dir nowhere\n")
+    broker = settings(found)["broker"]
+    assert not broker.get("anonymous")
+    assert not any(each.get("anonymous") for each in broker["listeners"])
+    rules = acl(found, tmp_path)
+    assert not may(rules, None, Action.PUBLISH, "r2d2/cmd_vel")
+    assert not may(rules, "alice", Action.PUBLISH, "r2d2/cmd_vel")
+
+
+def test_links_that_lead_nowhere(tmp_path: Path) -> None:
+    folder = tmp_path / "d"
+    folder.mkdir()
+    (folder / "loop.conf").symlink_to("loop.conf")
+    with pytest.raises(ImportProblemsError, match=r"d/loop\.conf"):
+        convert(tmp_path, "listener 1\ninclude_dir d\n")
+
+
+def test_a_name_of_the_file_is_no_text_of_the_result(tmp_path: Path) -> None:
+    name = "x\ncontrol: evil.sock\n# y.conf"
+    (tmp_path / name).write_text("listener 1883\n")
+    found = import_mosquitto(tmp_path / name, "r2d2")
+    assert "control" not in settings(found)
+
+
+def test_settings_of_listeners_cannot_be_taken_back(tmp_path: Path) -> None:
+    text = "per_listener_settings true\nlistener 1883\nallow_anonymous false\n"
+    with pytest.raises(ImportProblemsError, match=r"conf:4: per_listener_settings is true before"):
+        convert(tmp_path, f"{text}per_listener_settings false\n")
 
 
 def test_includes_that_cannot_be(tmp_path: Path) -> None:
