@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import unicodedata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +21,8 @@ Does it announce itself? On the robot, `appliance status` says so in its line mD
 Does a firewall, there or here, let UDP port 5353 in?
 Its address does as well: appliance sub --host ADDRESS --ca ca.crt …"""
 
+_LONGEST = 40  # characters of a robot's name in the table
+_ON_OTHERS = ("Mn", "Me")  # categories of what is written upon the character before
 #: Characters that count as printable and show nothing: behind them a name could forge a column.
 _BLANKS = "\u115f\u1160\u2800\u3164\uffa0"
 
@@ -109,12 +112,17 @@ def _row(each: FoundAppliance, trusted: set[str]) -> tuple[str, ...]:
     if trusted:
         ca = "the same" if each.ca in trusted else f"ANOTHER: {ca}"
     return (
-        one_word(each.robot),
+        _short(one_word(each.robot)),
         ",".join(map(str, each.addresses)),
         ",".join(map(str, each.mqtt)) or "-",
         ",".join(map(str, each.console)) or "-",
         ca,
     )
+
+
+def _short(text: str) -> str:
+    """Cut where it would make all rows too wide to be read."""
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 def one_word(text: str) -> str:
@@ -123,7 +131,9 @@ def one_word(text: str) -> str:
 
 
 def _is_seen(character: str) -> bool:
-    return character.isprintable() and character != " " and character not in _BLANKS
+    if not character.isprintable() or character == " " or character in _BLANKS:
+        return False
+    return unicodedata.category(character) not in _ON_OTHERS
 
 
 def _escaped(character: str) -> str:

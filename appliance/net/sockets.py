@@ -126,7 +126,8 @@ def allow_files(needed: int) -> None:
     if most < needed:
         log.warning(
             "broker.limits.connections needs %d open files, and the system allows %d: raise its "
-            "limit (ulimit -Hn, or LimitNOFILE= of the systemd unit) or lower the number",
+            "limit (LimitNOFILE= of the systemd unit, --ulimit nofile= of a container, or ulimit "
+            "-Hn) or lower the number",
             needed,
             most,
         )

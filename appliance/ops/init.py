@@ -21,6 +21,7 @@ from appliance.access import Acl, Passwords, check_username
 from appliance.certs.addresses import DNS_NAME
 from appliance.config import ConfigError
 from appliance.config.settings import Vda5050Section
+from appliance.config.values import check_robot
 from appliance.host.environment import of_service
 from appliance.ops.first_link import (
     LINK_USER,
@@ -235,6 +236,11 @@ def initialise(
     for each in names:
         if not DNS_NAME.fullmatch(each):
             raise InitError(f"--name {each!r} is not a DNS name, such as robot.example.com")
+    if named := os.environ.get("APPLIANCE_ROBOT"):
+        try:
+            check_robot(named)
+        except ValueError as error:
+            raise InitError(f"APPLIANCE_ROBOT is {named!r}: the robot's name {error}") from None
     if manufacturer is not None and upstream is None:
         raise InitError("--vda5050 needs --upstream: the URL of the fleet's broker")
     try:

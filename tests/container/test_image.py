@@ -131,6 +131,7 @@ def test_an_interrupted_first_start_is_completed(podman: Engine, container: Cont
 def test_no_volumes(podman: Engine, container: Container) -> None:
     told = refused(podman)
     assert f"no volume is mounted at {DATA}" in told and f"-data:{DATA}" in told
+    assert f"-configuration:{CONFIGURATION}" in told  # both are said at once
     told = refused(podman, *container.volumes[2:])
     assert f"no volume is mounted at {CONFIGURATION}" in told
     # As it advises, to try it.
@@ -168,6 +169,8 @@ def test_other_commands_and_a_ros_of_the_image(podman: Engine, container: Contai
     assert "No such command 'fly'" in podman.run("--rm", IMAGE, "fly", code=2)
     told = podman.run("--rm", "--env", "ROS_SETUP=/gone/setup.sh", IMAGE, "--version")
     assert told.startswith("appliance: ROS_SETUP cannot be read: /gone/setup.sh\nappliance ")
+    told = podman.run("--rm", "--env", "ROS_SETUP=setup.sh", IMAGE, "--version")
+    assert "ROS_SETUP has to be the whole path of a file: setup.sh\nappliance " in told
     container.start()
     setup = podman.folder("first-configuration") / "setup.sh"
     setup.write_text("export ROS_DOMAIN_ID=87\necho sourced\n")

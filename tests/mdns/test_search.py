@@ -242,6 +242,14 @@ def test_none_is_found(
     assert run("find", "--timeout", "0") == 2
 
 
+def test_a_long_name_leaves_the_table_narrow(
+    lan: list[bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lan.append(packet("x", record=text(robot="x" * 240)))
+    assert run("find") == 0
+    assert capsys.readouterr().out.splitlines()[1].split()[0] == "x" * 39 + "…"
+
+
 def test_a_flood_is_said(lan: list[bytes], capsys: pytest.CaptureFixture[str]) -> None:
     lan += [packet(f"r{n}") for n in range(SERVICES + 1)]
     assert run("find") == 0
@@ -256,6 +264,7 @@ def test_a_flood_is_said(lan: list[bytes], capsys: pytest.CaptureFixture[str]) -
         ("\u202eb\u200b", r"\u202eb\u200b"),
         ("a\u2800\u3000\xa0b", r"a\u2800\u3000\xa0b"),
         ("größer🤖", "größer🤖"),
+        ("r2d2\ufe00", r"r2d2\ufe00"),
     ],
 )
 def test_a_name_is_one_word(

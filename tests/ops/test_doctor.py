@@ -128,6 +128,18 @@ def test_ports_of_the_running_one_are_its_own(appliance: ApplianceProcess, tmp_p
     assert f"is running, pid {appliance.pid}" in told["appliance"].text
 
 
+def test_a_port_of_a_program_that_cannot_be_seen(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a container: the program has no number there, nor has an appliance that is off."""
+    settings = write(here, broker={"listeners": [{"bind": "127.0.0.1:8883"}]})
+    monkeypatch.setattr(ports, "_listening", lambda: [("127.0.0.1", 8883, None)])
+    for running in (None, {"pid": 5, "listeners": []}):
+        [finding] = ports.ports(settings, running)
+        assert finding.level == "error" and "outside of this container" in finding.text
+        assert "ss -ltnp 'sport = :8883'" in finding.advice
+
+
 def test_a_port_that_another_program_has(here: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -37,6 +37,15 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
+def test_a_robot_of_the_environment_is_checked_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("APPLIANCE_ROBOT", "r2/d2")
+    with pytest.raises(InitError, match=r"APPLIANCE_ROBOT is 'r2/d2': the robot's name must be"):
+        list(initialise(tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
 def test_everything_is_made_and_good(tmp_path: Path) -> None:
     directory = tmp_path / "new" / "robot"
     steps = list(initialise(directory, robot="R2 D2!"))

@@ -195,7 +195,8 @@ def files(settings: Settings, running: dict[str, Any] | None) -> Iterator[Findin
         "error",
         "open files",
         f"{hard} allowed, {wanted} needed for broker.limits.connections",
-        f"LimitNOFILE={wanted} in the systemd unit, or a smaller broker.limits.connections",
+        f"LimitNOFILE={wanted} in the systemd unit, --ulimit nofile={wanted} for a container, or a "
+        "smaller broker.limits.connections",
     )
 
 

@@ -53,7 +53,7 @@ def _port(
         for host, port, holder in listening
         if port == bind.port and (host == bind.host or host in _ANY or bind.host in _ANY)
     ]
-    if holders and pid in holders:
+    if pid is not None and pid in holders:
         return Finding("ok", subject, f"the running appliance (pid {pid}) listens there")
     if holders:
         return Finding("error", subject, f"taken by {_name(holders[0])}", _advice(bind, holders))
@@ -89,8 +89,8 @@ def _advice(bind: Bind, holders: list[int | None]) -> str:
     name = _process_name(holders[0])
     if name is None:
         return (
-            f"as root, ss -ltnp 'sport = :{bind.port}' says whose it is; stop that, or change "
-            "broker.listeners"
+            f"on the host as root, ss -ltnp 'sport = :{bind.port}' says whose it is; stop that, or "
+            "change broker.listeners"
         )
     if name == "mosquitto":
         return "systemctl disable --now mosquitto, or change broker.listeners"
@@ -137,7 +137,9 @@ def _addresses() -> Iterator[Any]:
 
 def _name(pid: int | None) -> str:
     name = _process_name(pid)
-    return "a program of another user" if name is None else f"{name} (pid {pid})"
+    if name is None:
+        return "a program of another user, or outside of this container"
+    return f"{name} (pid {pid})"
 
 
 def _process_name(pid: int | None) -> str | None:

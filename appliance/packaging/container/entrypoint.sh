@@ -19,7 +19,8 @@ fail() {
 # is what is kept there.
 need_volume() {
     mountpoint -q "$1" || fail "no volume is mounted at $1, and $3 would be gone with the" \
-        "container. Start it with --volume $2:$1 (or, to try it, with --rm --volume $1)"
+        "container. Start it with --volume appliance-configuration:$config" \
+        "--volume appliance-data:$data (or, to try it, with --rm --volume $config --volume $data)"
     error=$({ : >"$1/.writable"; } 2>&1) && rm -f "$1/.writable" && return
     case $error in
     *"Read-only"*) fail "the volume at $1 is mounted read-only, and $3 belong there. Start the" \
@@ -42,7 +43,9 @@ first_start() {
 
 # As the service has it: a ROS that is gone does not keep the broker from its work.
 setup=${ROS_SETUP-${ROS_DISTRO:+/opt/ros/$ROS_DISTRO/setup.sh}}
-if [ -r "$setup" ]; then
+if [ -n "$setup" ] && [ "${setup#/}" = "$setup" ]; then
+    echo "appliance: ROS_SETUP has to be the whole path of a file: $setup" >&2
+elif [ -f "$setup" ] && [ -r "$setup" ]; then
     # shellcheck disable=SC1090
     . "$setup"
 elif [ -n "$setup" ]; then

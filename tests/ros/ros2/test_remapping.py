@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 from waiting import PATIENCE, until
@@ -17,7 +20,7 @@ from ros_domain import claim
 
 from appliance.ros.bridge import TopicSettings
 from appliance.ros.remapping import remapped_names, with_own_names
-from appliance.ros.ros2.node import Ros2Node
+from appliance.ros.ros2.node import Ros2Node, fault_of_arguments
 
 #: The node of a bridge with parameters is seen for a while after it has left: not by other tests.
 DOMAIN, _HELD = claim()
@@ -166,3 +169,37 @@ def test_names_of_the_graph_are_the_nodes_own():
         "/on/_action/x": 4,
         "/action": 6,
     }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--bogus"], "unknown: ['--bogus']"),
+        (["--params-file", "/nowhere/sim.yaml"], "Couldn't parse params file: '--params-file"),
+        (["-r", "say=base"], "Couldn't parse remap rule: '-r say=base'"),
+        (["-r", "__ns:=r2d2"], "Couldn't parse remap rule: '-r __ns:=r2d2'"),
+    ],
+)
+def test_arguments_that_ros_cannot_read_end_the_start(
+    isolated_domain: None, tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    """Tried again and again they would never be right."""
+    file = tmp_path / "appliance.yaml"
+    file.write_text("{robot: r2d2, broker: {listeners: [{bind: '127.0.0.1:0'}]}}")
+    done = subprocess.run(
+        [sys.executable, "-m", "appliance", "run", "-c", file, "--ros-args", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert f"ROS arguments (behind --ros-args): {said}" in done.stderr
+    assert " at /" not in done.stderr.splitlines()[-1]
+
+
+def test_arguments_that_are_right_are_no_fault(
+    isolated_domain: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert fault_of_arguments(["-r", "/a:=/b", "-p", "use_sim_time:=true"]) is None
+    monkeypatch.setenv("ROS_DOMAIN_ID", "no-number")
+    assert fault_of_arguments(["-r", "/a:=/b"]) is None, "which is not for the arguments"
