@@ -75,13 +75,17 @@ NOT_RUN = {
     " -DWITH_CLIENTS=OFF -DWITH_APPS=OFF -DWITH_PLUGINS=OFF -DWITH_DOCS=OFF": "the same",
     "make -C out mosquitto && cp out/src/mosquitto mosquitto-2.1.2": "the same",
     "scp dist/appliance robot:": "needs another computer",
-    "python3.12 -m venv --system-site-packages ~/appliance"
-    " && ~/appliance/bin/pip install .": "needs Python 3.12 and a network",
+    "python3.12 -m venv --system-site-packages ~/appliance-venv"
+    " && ~/appliance-venv/bin/pip install .": "needs Python 3.12 and a network",
     "apt install python3-rospy python3-diagnostic-msgs python3-geometry-msgs": "changes the system"
     " and needs a network; .ci/run installs these packages",
-    "cd ~/ros2_ws/src/ros-mqtt-appliance": "is for the next line",
-    "python3 -m venv --system-site-packages ~/appliance"
-    " && ~/appliance/bin/pip install .": "needs a sourced ROS and a network",
+    "cd src/ros-mqtt-appliance": "is for the next line",
+    "python3 -m venv --system-site-packages ~/appliance-venv"
+    " && ~/appliance-venv/bin/pip install .": "needs a sourced ROS and a network",
+    "cd ~/ros2_ws && colcon build --packages-select mqtt_appliance"
+    " && . install/setup.sh": "tests/packaging/test_ros_package.py makes a workspace and builds it",
+    "~/appliance-venv/bin/appliance init --dir ~/appliance --robot r2d2": "is in README as well",
+    "gunzip --stdout appliance-V-image-x86_64.tgz | docker load": "needs an engine, and a release",
     "cd ~/ros2_ws && rosdep install --from-paths src --ignore-src -y": "changes the system",
     "/usr/bin/python3 -m venv --system-site-packages ~/appliance/venv": "is for the next line",
     "~/appliance/venv/bin/pip install .": "needs a network",
@@ -101,6 +105,8 @@ STAND_INS = (
     ("appliance bench", "short-bench bench"),
     ("//broker.example", "//127.0.0.1:1"),  # nobody listens there
     ("https://robot.local:8443", "https://localhost:{web_port}"),
+    ("--cafile ca.crt -u operator -P PASSWORD ", "--cafile certs/ca.crt -u {user} -P {password} "),
+    ("-h localhost -p 8883 ", "-h localhost -p {port} "),
     ("--cacert ca.crt -u operator ", "--cacert ca.crt -u {user}:{password} "),
     ("--host robot.local", "--host localhost --port {port}"),
     (" … ", " -h localhost -p {port} --cafile certs/ca.crt -u {user} -P {password} "),
