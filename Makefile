@@ -17,6 +17,8 @@ WEB_PORT ?= 8443
 WORKERS ?= 4
 BIN := .venv/bin
 INSTALL := $(BIN)/pip install -q --use-pep517 --disable-pip-version-check -c constraints.txt
+# Of the build's own environment too, to which `-c` does not apply.
+COMPILING := APPLIANCE_COMPILE=1 PIP_CONSTRAINT=$(CURDIR)/constraints.txt
 INTEROP := tests/interop/mqttjs
 KILTED := .venv-kilted
 # Own interfaces both ways, services, actions, parameters, QoS, the loop's own subscriptions, losses, discovery, remapping.
@@ -63,7 +65,7 @@ test-kilted: $(KILTED)/test.stamp
 	$(KILTED)/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not timed' $(KILTED_TESTS)
 
 compiled: .venv/run.stamp
-	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
+	$(COMPILING) $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w dist .
 
 ifeq ($(COMPILE),1)
 binary: build/compiled
@@ -77,7 +79,7 @@ binary: .venv/binary.stamp
 .PHONY: build/compiled
 build/compiled: .venv/binary.stamp
 	@rm -rf build/lib.* build/bdist.* build/wheel $@
-	APPLIANCE_COMPILE=1 $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w build/wheel .
+	$(COMPILING) $(BIN)/pip wheel -q --use-pep517 --disable-pip-version-check --no-deps -w build/wheel .
 	@$(BIN)/python -m zipfile -e build/wheel/*.whl $@
 
 deb: binary

@@ -126,7 +126,7 @@ class Root:
         """Make what is missing, and then the one file and its deb. Returns the paths of both."""
         self._say("fetch the sources of Python and its libraries")
         versions = self._fetch_sources()
-        of_debian = [SUITE, self._mirror, self._machine, *self._packages()]
+        of_debian = [SUITE, self._mirror, self._machine, *self._packages(), LDD]
         of_python = [*of_debian, *versions, f"{self._optimized}", PYTHON_RECIPE.read_text()]
         if (self._cache / OUTDATED).exists():
             remove(self._root)  # perhaps there are some now

@@ -63,6 +63,7 @@ def binary():
     sources = [PROJECT / "pyproject.toml", Path(sysconfig.get_path("purelib"))]
     for kind in ("py", "spec", "xml"):
         sources += (PROJECT / "appliance").rglob(f"*.{kind}")
+    sources += (each for each in (PROJECT / "appliance/web/files").rglob("*") if each.is_file())
     if found.exists() and found.stat().st_mtime > max(each.stat().st_mtime for each in sources):
         return found
     built = subprocess.run(
