@@ -584,6 +584,7 @@ def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
         crashes.crash(error)
         raise
     finally:
+        gc.enable()
         crashes.stop()
         notifier.close()
     return 0

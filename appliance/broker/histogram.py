@@ -6,8 +6,8 @@ from bisect import bisect_left
 from itertools import accumulate
 from typing import Final
 
-#: The upper bounds of the buckets, in seconds; one more bucket is for the rest. Of a tuple whose
-#: length is in its type, compiled code takes items as if it were not set (mypyc 2.x).
+#: The upper bounds of the buckets, in seconds; one more bucket is for the rest. Its type has no
+#: length: compiled code takes a final tuple of so many floats for one that is not set (mypyc 2).
 BOUNDS: Final[tuple[float, ...]] = (
     *(0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05),
     *(0.1, 0.2, 0.5, 1.0, 2.0, 5.0),

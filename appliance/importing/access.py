@@ -88,7 +88,7 @@ class _Converter:
         overall = self._configuration.general.flag(
             "allow_anonymous", self._configuration.local_only
         )
-        if self._configuration.per_listener or self._configuration.is_incomplete:
+        if self._configuration.per_listener:
             overall = False
         if self._configuration.local_only and not overall:
             self._tell_of_local()
@@ -155,8 +155,6 @@ class _Converter:
                 text = "decided who may do what: nothing is allowed until acl.conf says so"
                 self._notes.add(self._plugin.place, self._plugin.name, text, to_do=True)
                 return _NOTHING
-            if self._configuration.is_incomplete:
-                return _NOTHING
             text = "whoever is let in may write every topic, those that command ROS too"
             self._notes.add(Place(self._configuration.name, 0), "no acl_file", text)
             return _EVERYTHING
@@ -204,8 +202,8 @@ class _Converter:
 
     def _text(self, statement: Statement) -> str | None:
         """The text of a file; None, with a note, where it cannot be read."""
-        path = locate(statement, self._directory)
-        if path is not None and path.is_file():
+        path = locate(statement, self._directory, self._notes)
+        if path is not None:
             try:
                 return read_text(path, "")
             except AccessFileError as error:

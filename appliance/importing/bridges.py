@@ -207,8 +207,8 @@ def _tls(bridge: Bridge, directory: Path, notes: Notes) -> dict[str, Any]:
         statement = bridge.get(option)
         if statement is None:
             continue
-        path = locate(statement, directory)
-        if path is None or not path.is_file():
+        path = locate(statement, directory, notes)
+        if path is None:
             text = f"there is no file {statement.value} here that can be read: put it there, and "
             text += f"name it as tls.{key} of the link"
             notes.add(statement.place, option, text, to_do=True)

@@ -51,9 +51,7 @@ def import_mosquitto(path: Path, robot: str) -> Imported:
     Raises ImportProblemsError when the configuration has mistakes, which it lists.
     """
     notes = Notes()
-    reader = Reader(path, notes)
-    configuration = assemble(reader.read(), path.name, notes)
-    configuration.is_incomplete = reader.missing
+    configuration = assemble(Reader(path, notes).read(), path.name, notes)
     directory = path.parent
     blocks: list[Block] = [
         configuration.general,

@@ -231,8 +231,8 @@ def tls(listeners: list[Listener], directory: Path, notes: Notes) -> dict[str, A
 def _add_file(
     statement: Statement, key: str, found: dict[str, Any], directory: Path, notes: Notes
 ) -> None:
-    path = locate(statement, directory)
-    if path is None or not path.is_file():
+    path = locate(statement, directory, notes)
+    if path is None:
         made = " (`appliance init` makes one of its own)" if key in ("certificate", "key") else ""
         text = f"there is no file {statement.value} here that can be read: put it there, and name "
         text += f"it as broker.tls.{key}{made}"

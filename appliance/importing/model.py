@@ -86,8 +86,6 @@ class Configuration:
     bridges: list[Bridge]
     per_listener: bool
     local_only: bool
-    #: Some of it is not here, and may have said who is let in.
-    is_incomplete: bool = False
 
     def security(self, listener: Listener) -> Block:
         """Where the options of access of that listener are."""
@@ -95,8 +93,6 @@ class Configuration:
 
     def is_anonymous(self, listener: Listener) -> bool:
         """Whether that listener lets in clients without a user name."""
-        if self.is_incomplete:
-            return False
         own = listener.get("listener_allow_anonymous")
         if own is not None:
             return own.flag

@@ -38,34 +38,45 @@ class Statement:
         return int(self.value)
 
 
-def locate(statement: Statement, directory: Path) -> Path | None:
-    """The file or folder that it names, relative to `directory`; None if there is none.
+def locate(statement: Statement, directory: Path, notes: Notes) -> Path | None:
+    """The file, or folder of an include_dir, that it names; None if there is none.
 
-    A configuration that was copied from another computer or out of a container has paths of there:
-    then it is what lies beside the configuration by the end of its path. Raises
-    ImportProblemsError where this computer has one under the path as well: taken for the other,
-    the rules would be those of somebody else, or none.
+    Relative paths are relative to `directory`. A configuration that was copied from another
+    computer or out of a container has whole paths of there: then it is what lies beside the
+    configuration by the end of its path. Raises ImportProblemsError where this computer has one
+    under the path as well: taken for the other, the rules would be somebody else's, or none.
     """
     path = Path(statement.value)
     whole = directory / path
+    if not path.is_absolute():
+        return whole if _is_there(whole, statement) else None
     parts = path.parts[1:]
     ends = (directory.joinpath(*parts[start:]) for start in range(len(parts)))
-    beside = next((end for end in ends if _exists(end)), None)
-    if not _exists(whole):
+    beside = next((end for end in ends if _is_there(end, statement)), None)
+    if not _is_there(whole, statement):
         return beside
-    if beside is None or whole.is_relative_to(directory) or whole.samefile(beside):
+    if whole.is_relative_to(directory) or (beside is not None and whole.samefile(beside)):
         return whole
-    text = (
-        f"{statement.name} names {whole}, which this computer has, and beside the configuration "
-        f"there is {beside}: write the path of the one that is meant"
-    )
-    raise ImportProblemsError([(statement.place, text)])
+    if beside is not None:
+        text = (
+            f"names {whole}, which this computer has, and beside the configuration there is "
+            f"{beside}. If that is meant, write {beside.relative_to(directory)}; if not, move it"
+        )
+        raise ImportProblemsError([(statement.place, f"{statement.name} {text}")])
+    if statement.name in _OF_ACCESS:
+        text = f"is {whole} of this computer: is that the one of the imported broker?"
+        notes.add(statement.place, statement.name, text, to_do=True)
+    return whole
 
 
-def _exists(path: Path) -> bool:
-    """Whether it is there, as far as this user may know."""
+#: Options whose file says who may do what: another computer's would be a mistake with results.
+_OF_ACCESS = ("include_dir", "password_file", "acl_file")
+
+
+def _is_there(path: Path, statement: Statement) -> bool:
+    """Whether that is there, as far as this user may know, and of the kind that is named."""
     try:
-        return path.exists()
+        return path.is_dir() if statement.name == "include_dir" else path.is_file()
     except OSError:
         return False
 
@@ -97,8 +108,6 @@ class Reader:
         self.directory = main.parent
         self.statements: list[Statement] = []
         self.problems: list[tuple[Place, str]] = []
-        #: A folder with more of the configuration is not there.
-        self.missing = False
         self._main = main
         self._notes = notes
         self._included: set[Path] = set()
@@ -163,9 +172,13 @@ class Reader:
             self._notes.add(place, "include_dir", text)
             return
         try:
-            folder = locate(statement, self.directory)
-            if folder is None or not folder.is_dir():
-                self._is_missing(statement)
+            folder = locate(statement, self.directory, self._notes)
+            if folder is None:
+                text = (
+                    f"include_dir: there is no folder {statement.value} here, and what it has may "
+                    "say who is let in: copy it beside the file, or take this line out"
+                )
+                self.problems.append((place, text))
                 return
             found = [each for each in folder.iterdir() if each.name.endswith(".conf")]
         except ImportProblemsError as error:
@@ -176,6 +189,9 @@ class Reader:
             return
         if not found:
             text = f"{folder} has no file that ends in .conf, so nothing is read from there"
+            if not folder.is_relative_to(self.directory):
+                text += ": copy the imported broker's beside the file, or take this line out"
+                self.problems.append((place, f"include_dir {text}"))
             self._notes.add(place, "include_dir", text)
         for file in sorted(
             found, key=lambda each: [(letter.lower(), letter) for letter in each.name]
@@ -192,15 +208,6 @@ class Reader:
             else:
                 self._included.add(resolved)
                 self._read(file, is_main=False)
-
-    def _is_missing(self, statement: Statement) -> None:
-        self.missing = True
-        text = (
-            f"there is no folder {statement.value} here, so what it has is not carried over: copy "
-            "it beside the file, and import into another folder. As it may have said who is let "
-            "in, no anonymous client is, and without an acl_file nothing is allowed"
-        )
-        self._notes.add(statement.place, "include_dir", text, to_do=True)
 
     def _name(self, path: Path) -> str:
         try:

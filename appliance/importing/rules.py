@@ -67,7 +67,8 @@ def _carried(line: str, place: Place, notes: Notes) -> str:
         text = f"is left out: {odd[0]!r} {what}; write what is meant for each client"
         notes.add(place, line.strip(), text, to_do=True)
         return f"# {line}"
-    if levels[0] in odd and levels[0].startswith("$"):  # + stands for no such level
+    # + stands for no first level with $, which a name may have at its beginning, too.
+    if levels[0] in odd and levels[0].startswith(("$", *_NAMES)):
         problem = f"{line.strip()}: {odd[0]!r} {what}; write what is denied to each client"
         raise ImportProblemsError([(place, problem)])
     text = f"denies more than it did: {odd[0]!r} {what}, and all that can be there is meant"

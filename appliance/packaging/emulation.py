@@ -29,7 +29,8 @@ _WITH_USERS = """
 namespace=/proc/$$/ns/user
 here=$(readlink $namespace)
 ( (
-    while [ "$(readlink $namespace)" = "$here" ]; do sleep 0.01; done
+    tries=500
+    while [ "$(readlink $namespace)" = "$here" ] && [ $((tries -= 1)) -gt 0 ]; do sleep 0.01; done
     for kind in gid uid; do
         map=$(
             while read -r inside _ count; do
@@ -38,7 +39,7 @@ here=$(readlink $namespace)
         )
         echo "$map" >/proc/$$/${kind}_map
     done
-) & )
+) </dev/null >/dev/null 2>&1 & )
 exec unshare --user --mount --propagation private sh -c '
     tries=500
     until [ "$(id -u)" = 0 ]; do

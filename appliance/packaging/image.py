@@ -145,6 +145,6 @@ class Image:
         return self._run(*self._prefix(), *words, cwd=self._folder)
 
     def _prefix(self) -> list[str]:
-        """What is mounted is in a namespace of its own, and gone with it also if it is killed."""
-        own = ["unshare", "--mount", "--propagation", "private", "--pid", "--fork", "--mount-proc"]
-        return emulation.prefix(self._machine) or own
+        """What is mounted is in a namespace of its own, and gone with it."""
+        own = ["unshare", "--mount", "--propagation", "private", "--pid", "--kill-child"]
+        return emulation.prefix(self._machine) or [*own, "--mount-proc"]

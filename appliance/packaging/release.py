@@ -94,7 +94,7 @@ class Release:
         if found is None:
             raise ReleaseError('pyproject.toml has no line `version = "…"`')
         tags = self._run(*git, "tag", "--points-at", "HEAD", cwd=PROJECT).split()
-        if wrong := [tag for tag in tags if tag.startswith("v") and tag != f"v{found[1]}"]:
+        if wrong := [tag for tag in tags if re.match(r"v\d", tag) and tag != f"v{found[1]}"]:
             raise ReleaseError(
                 f"the tag {wrong[0]} is not for version {found[1]} of pyproject.toml"
             )

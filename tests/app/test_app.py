@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import signal
 import socket
@@ -16,6 +17,7 @@ from waiting import PATIENCE
 
 from appliance import config
 from appliance.access import Passwords
+from appliance.app import main
 from appliance.app.main import App
 from appliance.mqtt.packets import (
     Connack,
@@ -195,3 +197,40 @@ def test_a_reload_during_the_start_comes_after_it(
     monkeypatch.setattr(App, "reload", reload)
     uvloop.run(asyncio.wait_for(App(config.load(file)).run(), PATIENCE))
     assert len(reloaded) == 1 and reloaded[0]
+
+
+def test_garbage_is_collected_from_the_end_of_the_start_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """During the start it is not, whatever that restores; and not to go on would be a leak."""
+    file = tmp_path / "appliance.yaml"
+    file.write_text(
+        "robot: r2d2\nbroker: {anonymous: true, listeners: [{bind: '127.0.0.1:0'}]}\n"
+        "bridge: {bus: none}\n"
+    )
+    (tmp_path / "acl.conf").write_text("topic #\n")
+    (tmp_path / "users.passwd").touch(0o600)
+    own = App.start
+    during: list[bool] = []
+    afterwards: list[bool] = []
+
+    async def start(app: App) -> None:
+        during.append(gc.isenabled())
+        await own(app)
+        asyncio.get_running_loop().call_later(0.05, ended, app)
+
+    def ended(app: App) -> None:
+        afterwards.append(gc.isenabled())
+        app.request_stop()
+
+    monkeypatch.setattr(App, "start", start)
+    thresholds = gc.get_threshold()
+    try:
+        assert main.run(config.load(file)) == 0
+    finally:
+        gc.set_threshold(*thresholds)
+    assert (during, afterwards) == ([False], [True])
+    file.write_text(file.read_text().replace("127.0.0.1:0", "192.0.2.1:1"))  # nobody's address
+    with pytest.raises(OSError, match=r"192\.0\.2\.1:1"):
+        main.run(config.load(file))
+    assert gc.isenabled()

@@ -386,9 +386,11 @@ def test_rules_on_control_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_denial_that_cannot_be_kept_is_an_error(tmp_path: Path) -> None:
-    lines = "topic readwrite #\npattern deny $x%u/a\n"
-    with pytest.raises(ImportProblemsError, match=r"acl:2: pattern deny .* is no whole level"):
-        convert(tmp_path, "listener 1883\nacl_file acl\n", acl=lines)
+    """A user may be called $dev: + is no level that begins with $."""
+    for denied in ("$x%u/a", "%u-x/a", "%c.x/a"):
+        lines = f"topic readwrite #\npattern deny {denied}\n"
+        with pytest.raises(ImportProblemsError, match=r"acl:2: pattern deny .* is no whole level"):
+            convert(tmp_path, "listener 1883\nacl_file acl\n", acl=lines)
 
 
 @pytest.mark.parametrize(
@@ -718,15 +720,29 @@ def test_what_this_computer_has_is_not_taken_for_what_lies_beside(tmp_path: Path
         convert(copy, lines, **{"c.pem": ""})
 
 
-@pytest.mark.parametrize("rest", ["", "allow_anonymous true\nlistener 1883\n"])
-def test_without_a_part_of_the_configuration_nothing_is_open(tmp_path: Path, rest: str) -> None:
-    found = convert(tmp_path, f"{rest}include_dir nowhere\n")
-    broker = settings(found)["broker"]
-    assert not broker.get("anonymous")
-    assert not any(each.get("anonymous") for each in broker["listeners"])
-    rules = acl(found, tmp_path)
-    assert not may(rules, None, Action.PUBLISH, "r2d2/cmd_vel")
-    assert not may(rules, "alice", Action.PUBLISH, "r2d2/cmd_vel")
+def test_what_only_this_computer_has_is_a_question(tmp_path: Path) -> None:
+    here, copy = tmp_path / "etc/mosquitto", tmp_path / "copy"
+    for folder in (here / "conf.d", copy):
+        folder.mkdir(parents=True)
+    with pytest.raises(ImportProblemsError, match=r"conf.d has no file that ends in \.conf"):
+        convert(copy, f"listener 1883\ninclude_dir {here}/conf.d\n")
+    (here / "acl").write_text("topic read a\n")
+    (here / "pw").write_text("")
+    text = f"listener 1883\nacl_file {here}/acl\npassword_file {here}/pw\n"
+    found = convert(copy, text)
+    for line, option in ((2, "acl_file"), (3, "password_file")):
+        assert f"mosquitto.conf:{line}: {option}: is {here}/" in told(found)
+    assert "of this computer" not in told(convert(here, text))
+
+
+def test_only_whole_paths_are_looked_for_beside(tmp_path: Path) -> None:
+    """A relative one is the broker's own: mosquitto would not start without the file."""
+    text = "listener 1883\nallow_anonymous true\nacl_file {}/acl\n"
+    found = convert(tmp_path, text.format("strict"), acl="topic readwrite #\n")
+    assert not may(acl(found, tmp_path), None, Action.PUBLISH, "a")
+    (tmp_path / "rules/acl").mkdir(parents=True)  # of another kind than the file that is meant
+    found = convert(tmp_path, text.format("/srv/rules"), acl="topic readwrite #\n")
+    assert may(acl(found, tmp_path), None, Action.PUBLISH, "a")
 
 
 def test_links_that_lead_nowhere(tmp_path: Path) -> None:
@@ -751,8 +767,8 @@ def test_settings_of_listeners_cannot_be_taken_back(tmp_path: Path) -> None:
 
 
 def test_includes_that_cannot_be(tmp_path: Path) -> None:
-    found = convert(tmp_path, "listener 1\ninclude_dir nowhere\n")
-    assert "mosquitto.conf:2: include_dir: there is no folder nowhere here" in told(found)
+    with pytest.raises(ImportProblemsError, match="conf:2: include_dir: there is no folder nowhe"):
+        convert(tmp_path, "listener 1\ninclude_dir nowhere\n")
     with pytest.raises(ImportProblemsError, match="would include itself"):
         convert(tmp_path, "include_dir .\n")
     folder = tmp_path / "d"

@@ -67,7 +67,7 @@ def test_what_is_not_committed_is_named(project: Path, made: release.Release) ->
         made._clone()
 
 
-@pytest.mark.parametrize("tag", ["v1.2.4", "vnext", "v-1.2.3"])
+@pytest.mark.parametrize("tag", ["v1.2.4", "v1.2.3-rc1", "v2"])
 def test_a_tag_of_another_version_is_refused(
     project: Path, made: release.Release, tag: str
 ) -> None:

@@ -253,3 +253,32 @@ def test_the_copy_of_the_project_is_what_git_would_take(tmp_path: Path) -> None:
     copy = Root(tmp_path, root.MIRROR, False, HERE)._copy_project()
     assert (copy / "appliance/packaging/root.py").read_bytes() == Path(root.__file__).read_bytes()
     assert not list(copy.rglob("__pycache__")) and not list((copy / ".venv").iterdir())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone maps all users")
+def test_a_namespace_that_cannot_be_made_is_a_failure(tmp_path: Path) -> None:
+    """And nothing waits for it: neither what is left behind nor who reads the output."""
+    (tmp_path / "unshare").write_text("#!/bin/sh\necho not permitted >&2; exit 1\n")
+    (tmp_path / "unshare").chmod(0o755)
+    other = next(each for each in emulation.ARCHITECTURES if each != os.uname().machine)
+    done = subprocess.run(
+        [*emulation.prefix(other), "true"],
+        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+    assert (done.returncode, done.stderr) == (1, "not permitted\n")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root alone maps all users")
+def test_in_its_namespace_there_are_all_users(tmp_path: Path) -> None:
+    other = next(each for each in emulation.ARCHITECTURES if each != os.uname().machine)
+    if not (emulation.RULES / f"qemu-{other}.conf").exists():
+        pytest.skip("needs qemu's rules: apt install qemu-user-static")
+    script = "chown 8883:33 x && stat -c %u:%g x && exit 7"
+    (tmp_path / "x").touch()
+    command = [*emulation.prefix(other), "sh", "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout) == (7, "8883:33\n"), done.stderr
+    assert (tmp_path / "x").stat().st_uid == 8883

@@ -697,16 +697,36 @@ def fault_of_arguments(arguments: Sequence[str]) -> str | None:
     """What ROS has against its own arguments, those behind `--ros-args`; None if nothing, or where
     there is no ROS that could be asked.
 
-    What only a node can tell, such as a value of another type than its parameter, is not seen.
+    It is asked in a process of its own, before any thread is started here: rcl ends its process
+    over what it does not like. What only a node can tell, such as a value of another type than its
+    parameter, is not seen.
     """
+    if not available()[0] or _wrong_domain():
+        return None
+    outcome, to_parent = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.write(to_parent, _fault_of_arguments(arguments).encode(errors="replace"))
+        finally:
+            os._exit(0)
+    os.close(to_parent)
+    with os.fdopen(outcome, "rb") as told:
+        text = told.read().decode()
+    os.waitpid(child, 0)
+    return text or None
+
+
+def _fault_of_arguments(arguments: Sequence[str]) -> str:
+    """The text of the fault, short enough for a pipe; empty without one."""
     try:
         error = _refusal(["--ros-args", *arguments])
-    except ImportError:
-        return None
-    if error is None or _refusal([]) is not None:  # it is not for the arguments
-        return None
+        if error is None or _refusal([]) is not None:  # it is not for the arguments
+            return ""
+    except Exception:  # a ROS that cannot be imported is the bridge's matter
+        return ""
     text = re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split()))  # places in rcl's sources
-    text = text.removeprefix("failed to initialize rcl: ")
+    text = text.removeprefix("failed to initialize rcl: ")[:1000]
     return f"unknown: {text}" if type(error).__name__ == "UnknownROSArgsError" else text
 
 

@@ -203,3 +203,7 @@ def test_arguments_that_are_right_are_no_fault(
     assert fault_of_arguments(["-r", "/a:=/b", "-p", "use_sim_time:=true"]) is None
     monkeypatch.setenv("ROS_DOMAIN_ID", "no-number")
     assert fault_of_arguments(["-r", "/a:=/b"]) is None, "which is not for the arguments"
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    # rcl would end its process, and the broker has to run without a bridge.
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_of_nobody")
+    assert fault_of_arguments(["--bogus"]) is None
