@@ -170,17 +170,23 @@ def edit(file: Path) -> None:
     file.write_text(file.read_text() + "log: {level: debug}\n")
 
 
-@pytest.mark.parametrize("ask", [hang_up, edit])
-def test_a_reload_during_the_start_comes_after_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ask: Callable[[Path], None]
-) -> None:
-    file = tmp_path / "appliance.yaml"
+def small(directory: Path) -> Path:
+    """A configuration with all its files and nothing of the computer: no ROS, no known port."""
+    file = directory / "appliance.yaml"
     file.write_text(
         "robot: r2d2\nbroker: {anonymous: true, listeners: [{bind: '127.0.0.1:0'}]}\n"
         "bridge: {bus: none}\n"
     )
-    (tmp_path / "acl.conf").write_text("topic #\n")
-    (tmp_path / "users.passwd").touch(0o600)
+    (directory / "acl.conf").write_text("topic #\n")
+    (directory / "users.passwd").touch(0o600)
+    return file
+
+
+@pytest.mark.parametrize("ask", [hang_up, edit])
+def test_a_reload_during_the_start_comes_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ask: Callable[[Path], None]
+) -> None:
+    file = small(tmp_path)
     own = App.start
     reloaded: list[object] = []
 
@@ -203,13 +209,7 @@ def test_garbage_is_collected_from_the_end_of_the_start_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """During the start it is not, whatever that restores; and not to go on would be a leak."""
-    file = tmp_path / "appliance.yaml"
-    file.write_text(
-        "robot: r2d2\nbroker: {anonymous: true, listeners: [{bind: '127.0.0.1:0'}]}\n"
-        "bridge: {bus: none}\n"
-    )
-    (tmp_path / "acl.conf").write_text("topic #\n")
-    (tmp_path / "users.passwd").touch(0o600)
+    file = small(tmp_path)
     own = App.start
     during: list[bool] = []
     afterwards: list[bool] = []
