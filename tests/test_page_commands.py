@@ -56,7 +56,7 @@ NOT_RUN = {
     ' --machine x86_64"': "builds for half an hour; tests/packaging has its parts",
     "apt install git gcc python3-dev python3-venv lintian": "changes the system",
     "apt install mmdebstrap bubblewrap debian-archive-keyring": "changes the system",
-    "apt install gcc-aarch64-linux-gnu qemu-user-static": "changes the system",
+    "apt install gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static": "changes the system",
     'git tag --annotate v1.2.3 --message "Version 1.2.3"': "makes a release of this repository",
     "git push origin v1.2.3": "needs another computer",
     "gpg --armor --detach-sign dist/SHA256SUMS": "needs a person's key",
