@@ -86,7 +86,8 @@ class Image:
         context = self._folder / "context"
         base = context / "base.tar"
         self._within(
-            *("mmdebstrap", "--quiet", "--variant=minbase", "--skip=check/qemu"),
+            # Device nodes cannot be unpacked in a user namespace, and containers get their own.
+            *("mmdebstrap", "--quiet", "--variant=minbase", "--skip=check/qemu,output/dev"),
             *(f"--dpkgopt=path-exclude=/usr/share/{each}/*" for each in _LEFT_OUT),
             f"--architectures={emulation.ARCHITECTURES[self._machine]}",
             *("--include=python3,python3-venv", SUITE, base),
