@@ -17,7 +17,7 @@ from appliance.mqtt.topics import check_filter, check_topic
 _log = logging.getLogger(__name__)
 
 # The white space of C's isspace(), which mosquitto trims. Python's strip() trims more.
-_BLANK: Final = " \t\n\v\f\r"
+BLANK: Final = " \t\n\v\f\r"
 _KEYWORDS: Final = ("topic", "pattern", "user", "include")
 
 # Limits of one file of rules with its included files: beyond these it is a mistake, such as the
@@ -243,7 +243,7 @@ class _AclReader:
                     path,
                 )
         for number, raw in enumerate(text.split("\n"), 1):
-            line = raw.rstrip(_BLANK)
+            line = raw.rstrip(BLANK)
             if not line or line[0] == "#":
                 continue
             try:
@@ -257,7 +257,7 @@ class _AclReader:
         keyword = line[column:].partition(" ")[0]
         _check_keyword(keyword, column)
         start = _skip(line, column + len(keyword))
-        rest = line[start:].lstrip(_BLANK)
+        rest = line[start:].lstrip(BLANK)
         if not rest:
             what = {"user": "a user name", "include": "a file"}.get(keyword, "a filter")
             raise _LineError(start, f"{what} is missing after {keyword!r}")
@@ -270,7 +270,7 @@ class _AclReader:
     def _clause(self, line: str, start: int, pattern: bool) -> tuple[Permission, str]:
         """What follows `topic` or `pattern` from column `start` on: [access] filter."""
         word, _, rest = line[start:].partition(" ")
-        filter = rest.lstrip(_BLANK)
+        filter = rest.lstrip(BLANK)
         if filter:
             permission = _PERMISSIONS.get(word)
             if permission is None:

@@ -17,6 +17,8 @@ _MAX_LINE = 70_000  # more than a topic has, the longest value there is
 _HEAD_SIZE = 4096
 _FLAGS = {"true": True, "1": True, "false": False, "0": False}
 _NUMBER_DIGITS = 15
+#: Options whose file says who may do what: another computer's would be a mistake with results.
+_OF_ACCESS = ("include_dir", "password_file", "acl_file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +69,6 @@ def locate(statement: Statement, directory: Path, notes: Notes) -> Path | None:
         text = f"is {whole} of this computer: is that the one of the imported broker?"
         notes.add(statement.place, statement.name, text, to_do=True)
     return whole
-
-
-#: Options whose file says who may do what: another computer's would be a mistake with results.
-_OF_ACCESS = ("include_dir", "password_file", "acl_file")
 
 
 def _is_there(path: Path, statement: Statement) -> bool:

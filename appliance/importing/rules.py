@@ -7,13 +7,13 @@ import tempfile
 from pathlib import Path
 
 from appliance.access import AccessFileError, Acl
+from appliance.access.rules import BLANK
 from appliance.importing.notes import ImportProblemsError, Notes, Place
 
 #: As both brokers read a line: spaces between the words, and any blanks around the filter.
-_BLANK = " \t\n\v\f\r"
 _CLAUSE = re.compile(
     r"(?P<head> *(?P<keyword>topic|pattern) +(?:(?P<access>read|write|readwrite|deny) +)?"
-    rf"[{_BLANK}]*)(?P<filter>[^{_BLANK}].*)"
+    rf"[{BLANK}]*)(?P<filter>[^{BLANK}].*)"
 )
 _NAMES = ("%c", "%u")
 _ROBOT = "{robot}"  # which is replaced here
@@ -51,7 +51,7 @@ def _check(text: str, name: str) -> None:
 
 
 def _carried(line: str, place: Place, notes: Notes) -> str:
-    found = _CLAUSE.fullmatch(line.rstrip(_BLANK))
+    found = _CLAUSE.fullmatch(line.rstrip(BLANK))
     if found is None:
         return line
     levels = found["filter"].split("/")

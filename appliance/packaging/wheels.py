@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -101,22 +102,17 @@ def pythons_here() -> list[Python]:
 
 def check_compiler(machine: str) -> None:
     """Raises WheelError unless there is a compiler for it, with the headers of its C library."""
-    compiler = COMPILERS.get(machine, "cc")
-    package = "gcc" if machine not in COMPILERS else f"gcc-{machine}-linux-gnu"
-    try:
-        tried = subprocess.run(
-            [compiler, "-E", "-"], input=b"#include <limits.h>\n", capture_output=True, check=False
-        )
-    except OSError:
-        raise WheelError(
-            f"there is no compiler for {machine} here: apt install {package}"
-        ) from None
-    if tried.returncode:
+    if machine == os.uname().machine:
+        compiler, package, library = "cc", "gcc", "libc6-dev"
+    else:
+        compiler, package = COMPILERS.get(machine, ""), f"gcc-{machine}-linux-gnu"
         library = f"libc6-dev-{emulation.ARCHITECTURES[machine]}-cross"
-        raise WheelError(
-            f"{compiler} does not find the C library's headers: apt install "
-            f"{library if machine in COMPILERS else 'libc6-dev'}"
-        )
+    if not compiler or not shutil.which(compiler):
+        raise WheelError(f"there is no compiler for {machine} here: apt install {package}")
+    command = [compiler, "-E", "-"]
+    source = b"#include <limits.h>\n"
+    if subprocess.run(command, input=source, capture_output=True, check=False).returncode:
+        raise WheelError(f"{compiler} does not find the C library's headers: apt install {library}")
 
 
 def unpack(sdist: Path, directory: Path) -> Path:

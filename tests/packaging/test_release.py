@@ -12,6 +12,7 @@ import sys
 import tarfile
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -72,7 +73,7 @@ def test_a_tag_of_another_version_is_refused(
     project: Path, made: release.Release, tag: str
 ) -> None:
     git("tag", tag, cwd=project)
-    with pytest.raises(release.ReleaseError, match=f"{tag} is not for version 1.2.3"):
+    with pytest.raises(release.ReleaseError, match=re.escape(f"{tag} is not for version 1.2.3")):
         made._clone()
 
 
@@ -302,6 +303,8 @@ def test_a_compiler_has_its_c_library(tmp_path: Path, monkeypatch: pytest.Monkey
     compiler = tmp_path / "aarch64-linux-gnu-gcc"
     compiler.write_text("#!/bin/sh\nexit 1\n")
     monkeypatch.setenv("PATH", str(tmp_path))
+    here = SimpleNamespace(machine="x86_64")
+    monkeypatch.setattr(os, "uname", lambda: here)
     with pytest.raises(wheels.WheelError, match="apt install gcc-aarch64-linux-gnu"):
         wheels.check_compiler("aarch64")
     compiler.chmod(0o755)
@@ -309,6 +312,11 @@ def test_a_compiler_has_its_c_library(tmp_path: Path, monkeypatch: pytest.Monkey
         wheels.check_compiler("aarch64")
     compiler.write_text("#!/bin/sh\n")
     wheels.check_compiler("aarch64")
+    here.machine = "aarch64"  # for itself its own is used; for x86-64 there is none
+    with pytest.raises(wheels.WheelError, match="no compiler for aarch64 here: apt install gcc$"):
+        wheels.check_compiler("aarch64")
+    with pytest.raises(wheels.WheelError, match="no compiler for x86_64 here"):
+        wheels.check_compiler("x86_64")
 
 
 def test_an_image_needs_a_wheel_and_its_tools(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -221,7 +221,7 @@ def test_the_command_is_found(tmp_path):
         return path
 
     own, first, second = command("own"), command("first"), command("second")
-    at_home, named = command("home/appliance-venv/bin"), command("named")
+    at_home, named = command("home/appliance/bin"), command("named")
     (tmp_path / "none/appliance").mkdir(parents=True)  # a folder of that name is no command
     paths = [str(tmp_path / name) for name in ("none", "own", "first", "second")]
     environment = {"PATH": os.pathsep.join(["", *paths]), "HOME": str(tmp_path / "home")}
@@ -232,6 +232,8 @@ def test_the_command_is_found(tmp_path):
     beside = {**environment, "PATH": str(tmp_path / "none")}
     if not any(Path(place).exists() for place in start.PLACES):  # this computer has none
         assert start.find_command(beside, own) == str(at_home)
+        first_there = command("home/appliance-venv/bin")
+        assert start.find_command(beside, own) == str(first_there)
         assert start.find_command({"PATH": ""}, own) is None
     with pytest.raises(ValueError, match="is no-such-command, which is not a program"):
         start.find_command({**environment, start.VARIABLE: "no-such-command"}, own)
