@@ -313,7 +313,7 @@ def test_a_compiler_has_its_c_library(tmp_path: Path, monkeypatch: pytest.Monkey
     compiler.write_text("#!/bin/sh\n")
     wheels.check_compiler("aarch64")
     here.machine = "aarch64"  # for itself its own is used; for x86-64 there is none
-    with pytest.raises(wheels.WheelError, match="no compiler for aarch64 here: apt install gcc$"):
+    with pytest.raises(wheels.WheelError, match=r"no compiler for aarch64 here: apt install gcc$"):
         wheels.check_compiler("aarch64")
     with pytest.raises(wheels.WheelError, match="no compiler for x86_64 here"):
         wheels.check_compiler("x86_64")
