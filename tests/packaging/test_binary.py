@@ -284,7 +284,8 @@ def test_programs_that_it_starts_run_in_it_too(box, bare_root):
     assert json.loads(measured.stdout)
     house.stop()
     settings = yaml.safe_load((house.directory / "appliance.yaml").read_text())
-    settings["bridge"] = {"topics": [{"ros": "/chatter", "to": "mqtt", "encoding": "text"}]}
+    chatter = {"ros": "/chatter", "to": "mqtt", "encoding": "text"}
+    settings["bridge"] = {"topics": [chatter, {"ros": "/odom", "to": "mqtt"}]}
     (house.directory / "appliance.yaml").write_text(yaml.safe_dump(settings))
     house._run(house.command("demo", "-c", house.config))
     house.port = int(house.wait_for_log(LISTENING, 4)[-2].rpartition(":")[2])
