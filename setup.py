@@ -29,7 +29,7 @@ INTERPRETED = {
 }
 
 # Of the store: what runs for every message that is stored, and for every row at the start.
-STORE = ("loader", "messages", "rows")
+STORE = ("loader", "messages", "rows", "unread")
 
 # Of the link to a fleet's broker: what runs for every message of its backlog, and what that calls.
 UPSTREAM = (

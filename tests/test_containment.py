@@ -985,6 +985,7 @@ ELSEWHERE = {
     "reload.close": "app/test_inside.py",
     "stop.session": "test_containment.py",
     "store.read": "store/test_memory_backlogs.py",
+    "store.unread": "store/test_unread.py",
 }
 
 

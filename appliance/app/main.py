@@ -26,6 +26,7 @@ from appliance.app import management, status, wiring
 from appliance.app.links import Links
 from appliance.app.own_topics import orphaned_topics
 from appliance.app.reload import Reload, ReloadError, ReloadParts
+from appliance.app.stores import store_of
 from appliance.broker.broker import Broker
 from appliance.broker.histogram import Histogram
 from appliance.broker.link import InsideLink
@@ -65,7 +66,7 @@ from appliance.ros.node import RosNode
 from appliance.ros.ros1.node import Ros1Node
 from appliance.ros.ros2 import discovery
 from appliance.ros.ros2.node import Ros2Node
-from appliance.store import MemoryStore, SessionStore, SqliteStore, StoreError
+from appliance.store import SessionStore, StoreError
 from appliance.store.clock import boot_id
 
 if TYPE_CHECKING:
@@ -117,10 +118,12 @@ class App:
         ros_arguments: Sequence[str] = (),
         notifier: Notifier | None = None,
         crashes: CrashReports | None = None,
+        store: SessionStore | None = None,
     ) -> None:
         """Assign only; `start` reads files and opens ports. For the arguments see `run`."""
         self.settings = settings
         self._ros_arguments = ros_arguments
+        self._opening = store
         self._notifier = notifier or Notifier()
         self._crashes = crashes
         self.addresses: list[tuple[str, int]] = []
@@ -273,12 +276,7 @@ class App:
         self._stack.callback(self._announcer.announce, "the appliance is stopping")
 
     def _open_store(self) -> SessionStore:
-        wanted = self.settings.broker.store
-        store: SessionStore
-        if wanted.durability == "off":
-            store = MemoryStore()
-        else:
-            store = SqliteStore(wanted.path, wanted.durability, size=wanted.size, age=wanted.age)
+        store, self._opening = self._opening or store_of(self.settings.broker.store), None
         store.open()
         self._stack.push_async_callback(store.close)
         return store
@@ -565,10 +563,13 @@ class App:
         self._stopping.set()
 
 
-def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
+def run(
+    settings: Settings, ros_arguments: Sequence[str] = (), store: SessionStore | None = None
+) -> int:
     """Run the appliance until a signal stops it; returns the exit code of the command.
 
     `ros_arguments` are those behind `--ros-args`; they come after those of the configuration.
+    `store` is that of the settings, if it is being opened already.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until `App.run` handles it: it would end us
     _tune_garbage_collector()
@@ -577,7 +578,7 @@ def run(settings: Settings, ros_arguments: Sequence[str] = ()) -> int:
     crashes = CrashReports(settings.crash_reports, settings)
     crashes.start()
     try:
-        uvloop.run(App(settings, ros_arguments, notifier, crashes).run())
+        uvloop.run(App(settings, ros_arguments, notifier, crashes, store).run())
     except START_ERRORS:
         raise
     except Exception as error:

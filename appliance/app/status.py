@@ -157,7 +157,7 @@ class Status:
             "sessions": len(known),
             "subscriptions": broker.subscription_count - own,
             "retained": len(broker.retained),
-            "waiting": sum(len(session.queue) + len(session.inflight) for session in known),
+            "waiting": sum(session.waiting + len(session.inflight) for session in known),
         }
 
     def _messages(self) -> dict[str, Any]:

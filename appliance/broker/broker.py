@@ -442,7 +442,7 @@ class Broker:
             session,
             away,
             shortage,
-            len(session.queue),
+            session.waiting,
             what,
         )
 
@@ -888,7 +888,7 @@ class Broker:
             session,
             "takes its messages too slowly, its queue is full: %s (it has %d messages, %d bytes)",
             session.shortage(message.size),
-            len(session.queue),
+            session.waiting,
             session.bytes,
         )
 

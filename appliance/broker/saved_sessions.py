@@ -11,6 +11,7 @@ from appliance.broker.broker import Broker
 from appliance.broker.delivery import Delivery, PendingWill, UnreleasedPublish
 from appliance.broker.message import Message
 from appliance.broker.session import Session
+from appliance.broker.store import Unread
 from appliance.broker.values import Identity
 from appliance.mqtt.packets import Subscription
 
@@ -44,6 +45,8 @@ class SavedSession:
     #: By packet id, in the order sent; None where only PUBREL is left to be sent.
     inflight: dict[int, PendingDelivery | None] = field(default_factory=dict)
     queue: list[PendingDelivery] = field(default_factory=list)
+    #: The queue, if it is read later.
+    unread: Unread | None = None
     #: QoS 2 messages that wait for PUBREL, with the sessions and groups without room for them.
     received: dict[int, tuple[Message, list[str], list[str]]] = field(default_factory=dict)
     #: The restored session.
@@ -118,4 +121,5 @@ def _restore_deliveries(broker: Broker, entry: SavedSession) -> None:
             )
             for packet_id, (message, sessions, shares) in entry.received.items()
         },
+        entry.unread,
     )

@@ -16,6 +16,7 @@ from appliance.broker.delivery import Delivery, Group, PendingWill, UnreleasedPu
 from appliance.broker.link import Link
 from appliance.broker.max_rate import RateLimit, RateSchedule
 from appliance.broker.message import Message
+from appliance.broker.store import Unread
 from appliance.broker.values import Identity
 from appliance.mqtt.codec import text_size
 from appliance.mqtt.packets import Subscription
@@ -32,6 +33,12 @@ REPLAYS_PER_COST_UNIT = 8
 
 #: Messages of a session that are looked at for one unit of cost: whether others may have them.
 PASSED_PER_COST_UNIT = 16
+
+#: Messages of a restored queue that are read when the oldest one is to be dropped.
+FEW_READ = 16
+
+#: The cost of reading one of them.
+READ_COST = 2
 
 #: The size, in bytes, above which a message is large: an image or a map, not a state or a command.
 #: A slow client gets large QoS 0 messages after everything else, see `Link.is_behind`.
@@ -74,6 +81,21 @@ class SessionAccounting(Accounting):
         self.rates = RateSchedule(lambda: self.now)
 
 
+class Gap:
+    """The place in a restored queue of messages that are only in the store yet.
+
+    `Session.queue` has those before it, `newer` what came in since the start.
+    """
+
+    __slots__ = ("bytes", "newer", "unread")
+
+    def __init__(self, unread: Unread) -> None:
+        self.unread = unread
+        #: What the session counts for them.
+        self.bytes = unread.bytes
+        self.newer: deque[Delivery] = deque()
+
+
 class Replay:
     """The retained messages that a new subscription is still to be sent."""
 
@@ -108,6 +130,7 @@ class Session:
         "ends_at",
         "epoch",
         "expiry",
+        "gap",
         "identity",
         "inflight",
         "is_full_logged",
@@ -175,6 +198,8 @@ class Session:
         self.queue: deque[Delivery] = deque()
         #: The bytes of these messages: to add them up for each new one would cost as much as all.
         self.queue_bytes = 0
+        #: Set while the store has messages of the queue that were not read since the start.
+        self.gap: Gap | None = None
         #: Set while publishers may have to wait for its client.
         self.congestion: Congestion | None = None
         #: Retained messages of new subscriptions, by filter; they are sent before newer messages.
@@ -225,6 +250,13 @@ class Session:
     # --- towards the client -------------------------------------------------------------------
 
     @property
+    def waiting(self) -> int:
+        """QoS 1 and 2 messages that wait for the window or the client."""
+        if self.gap is None:
+            return len(self.queue)
+        return len(self.queue) + self.gap.unread.count + len(self.gap.newer)
+
+    @property
     def ready(self) -> bool:
         """Whether a message would be sent immediately."""
         link = self.link
@@ -232,6 +264,7 @@ class Session:
             link is not None
             and link.writable
             and not self.queue
+            and self.gap is None
             and not self.latest
             and not self.large
             and len(self.inflight) < self.window
@@ -270,6 +303,7 @@ class Session:
                 and link.writable
                 and len(self.inflight) < self.window
                 and not self.queue
+                and self.gap is None
                 and not self.replays
             ):
                 self.bytes += size
@@ -277,7 +311,7 @@ class Session:
                 accounting.queued_bytes += size
                 self._send(link, cast(Delivery, (message, qos, retain, subscription_ids, share)))
                 return True
-            if len(self.queue) < accounting.queue_messages:
+            if (len(self.queue) if self.gap is None else self.waiting) < accounting.queue_messages:
                 return self._enqueue(
                     cast(Delivery, (message, qos, retain, subscription_ids, share)), refusable
                 )
@@ -309,7 +343,7 @@ class Session:
         if self.expiry and not self._may_store(message, refusable):
             return False
         return limits.queue_full == "drop-oldest" or (
-            len(self.queue) < limits.queue_messages and self.fits(message.size)
+            self.waiting < limits.queue_messages and self.fits(message.size)
         )
 
     def _may_store(self, message: Message, refusable: bool) -> bool:
@@ -336,7 +370,7 @@ class Session:
         self.bytes += size
         self.account.bytes += size
         self.accounting.queued_bytes += size
-        self.queue.append(delivery)
+        (self.queue if self.gap is None else self.gap.newer).append(delivery)
         self.queue_bytes += size
         if self.congestion is None and 2 * len(self.queue) > self.accounting.queue_messages:
             self._congest()
@@ -353,9 +387,12 @@ class Session:
             return False
         if self.expiry and refusable and self.accounting.failing:
             return False
-        while self.queue and not (
-            len(self.queue) < accounting.queue_messages and self.fits(message.size)
+        while (self.queue or self.gap is not None) and not (
+            self.waiting < accounting.queue_messages and self.fits(message.size)
         ):
+            if not self.queue:
+                self._read(FEW_READ)
+                continue
             self._report_full(message.size)
             oldest = self.queue.popleft()
             self.queue_bytes -= oldest[0].size
@@ -398,7 +435,9 @@ class Session:
             self._pump_latest(link)
         if self.congestion is not None:
             self._relieve(self.congestion)
-        if self.unchecked and not (self.queue or self.latest or self.large or self.resends):
+        if self.unchecked and not (
+            self.queue or self.gap is not None or self.latest or self.large or self.resends
+        ):
             self.unchecked = False
 
     def _pump_resends(self, link: Link) -> None:
@@ -507,9 +546,41 @@ class Session:
                 self._last_packet_id = self._last_packet_id % 65535 + 1
             else:
                 self._send(link, delivery)  # it stays counted
+        if self.gap is not None and not self.queue:
+            self.gap.unread.hurry()
+
+    def read_on(self, count: int) -> None:
+        """Read up to so many messages of the queue that only the store has; send what can be."""
+        self._read(count)
+        self.pump()
+
+    def read_all(self) -> None:
+        """Read all messages of the queue that only the store has: as many as a queue may have."""
+        while self.gap is not None:
+            self._read(self.gap.unread.count)
+
+    def _read(self, count: int) -> None:
+        gap = self.gap
+        if gap is None:
+            return
+        found = gap.unread.read(count)
+        self.accounting.counters.cost += READ_COST * len(found)
+        gap.bytes -= sum(delivery[0].size for delivery in found)
+        self.queue.extend(found)
+        if not gap.unread.count:
+            self.gap = None
+            self.queue.extend(gap.newer)
+            # What could not be read, and what the estimate of a topic's memory was wrong by.
+            self.queue_bytes -= gap.bytes
+            self.take(-gap.bytes)
 
     def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
-        """Drop queued messages that are too old; returns their number."""
+        """Drop queued messages that are too old; returns their number.
+
+        While some are only in the store, none: they are looked at when they have been read.
+        """
+        if self.gap is not None:
+            return 0
         remaining = deque(delivery for delivery in self.queue if not is_old(delivery[0]))
         dropped = len(self.queue) - len(remaining)
         if dropped:
@@ -547,8 +618,12 @@ class Session:
         inflight: dict[int, Delivery | None],
         queue: list[Delivery],
         received: dict[int, UnreleasedPublish],
+        unread: Unread | None = None,
     ) -> None:
-        """Take over the messages that the store has for this session."""
+        """Take over the messages that the store has for this session.
+
+        `unread` are those of the queue that it reads later; `queue` is empty then.
+        """
         self.inflight.update(inflight)
         self.queue.extend(queue)
         self.received.update(received)
@@ -559,6 +634,10 @@ class Session:
         for held in received.values():
             self.take(held_size(held))
         self._last_packet_id = next(reversed(inflight), 0)
+        if unread is not None:
+            self.gap = Gap(unread)
+            self.queue_bytes += self.gap.bytes
+            self.take(self.gap.bytes)
 
     def resend(self) -> None:
         """Send again what was in flight when the last connection ended [MQTT-4.4.0-1]."""
@@ -880,8 +959,8 @@ class Session:
         """
         accounting = self.accounting
         limits = accounting.limits
-        if len(self.queue) >= limits.queue_messages:
-            return f"{len(self.queue)} messages wait already (broker.limits.queue_messages)"
+        if self.waiting >= limits.queue_messages:
+            return f"{self.waiting} messages wait already (broker.limits.queue_messages)"
         if self.bytes + size > accounting.queue_bytes:
             return f"{self.bytes} bytes wait already (broker.limits.queue_bytes)"
         if not self.fits(size):
@@ -900,7 +979,7 @@ class Session:
         accounting = self.accounting
         if self.congestion is not None and self.congestion.awaited:
             return True
-        if len(self.queue) >= accounting.queue_messages:
+        if self.waiting >= accounting.queue_messages:
             return True
         if (
             self.bytes + size <= accounting.half_queue
@@ -912,7 +991,7 @@ class Session:
     def _is_crowded(self) -> bool:
         """Whether the queue is more than half full."""
         accounting = self.accounting
-        return 2 * len(self.queue) > accounting.queue_messages or self.bytes > accounting.half_queue
+        return 2 * self.waiting > accounting.queue_messages or self.bytes > accounting.half_queue
 
     def _fits_tightly(self, size: int) -> bool:
         """`fits`, for a message that makes the session use more than half of its limit."""
@@ -929,7 +1008,7 @@ class Session:
         if self._is_crowded():
             return
         congestion.wake()
-        if not self.queue:
+        if not self.queue and self.gap is None:
             congestion.end()
             self.congestion = None
 
@@ -964,6 +1043,8 @@ class Session:
         passed on, too: the other member may get a duplicate. QoS 2 messages stay [MQTT-4.8.2-4],
         [MQTT-4.8.2-5].
         """
+        if self.gap is not None and self.gap.unread.is_shared:
+            self.read_all()
 
         def is_given(delivery: Delivery) -> bool:
             share = delivery[4]
@@ -1024,6 +1105,7 @@ class Session:
         for waiting in (self.queue, self.latest, self.large, self.inflight, self.received):
             waiting.clear()
         self.queue_bytes = 0
+        self.gap = None
         self.resends.clear()
         self.replays.clear()
         self.replays_of_qos_0.clear()

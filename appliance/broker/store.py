@@ -61,14 +61,43 @@ class SessionState(Protocol):
 
     @property
     def queue(self) -> Collection[Delivery]:
-        """Messages that were not sent yet."""
+        """Messages that were not sent yet, without those that `Unread` has."""
 
     @property
     def received(self) -> Mapping[int, UnreleasedPublish]:
         """QoS 2 messages from its client that wait for PUBREL, by packet id."""
 
+    def read_all(self) -> None:
+        """Have the rest of its queue read."""
+
     def drop_queued(self, is_old: Callable[[Message], bool]) -> int:
         """Drop queued messages that are too old; returns their number."""
+
+
+class Unread(Protocol):
+    """Messages of a session's queue that the store has not read since the start."""
+
+    @property
+    def count(self) -> int:
+        """How many are left."""
+
+    @property
+    def bytes(self) -> int:
+        """About as many bytes as the session counts for those that are left."""
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether any was for the session as a member of a group."""
+
+    def read(self, count: int) -> list[Delivery]:
+        """Read the oldest ones, up to so many.
+
+        There are fewer where a row is damaged. `count` is less afterwards in any case: what cannot
+        be read now is left to the next start.
+        """
+
+    def hurry(self) -> None:
+        """Its client waits: have the session read on before others."""
 
 
 class Store(Protocol):

@@ -63,7 +63,7 @@ class SysTopics:
         connected = len(broker.clients)
         total = sum(1 for session in broker.sessions.values() if not session.is_inside)
         stored = len(broker.retained) + sum(
-            len(session.queue) + sum(delivery is not None for delivery in session.inflight.values())
+            session.waiting + sum(delivery is not None for delivery in session.inflight.values())
             for session in broker.sessions.values()
         )
         values: dict[str, str | int] = {

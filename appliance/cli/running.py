@@ -105,7 +105,7 @@ def run(
 ) -> None:
     """Run the appliance until SIGINT or SIGTERM; ROS arguments follow `--ros-args`."""
     settings = load(config)
-    from appliance.app import main as app
+    from appliance.app.stores import store_of
     from appliance.ops import logs
 
     if context.obj and settings.bridge.bus == "ros2":
@@ -116,8 +116,12 @@ def run(
 
     log = settings.log
     logs.setup(log_level or log.level, log.levels, log_format or log.format)
+    store = store_of(settings.broker.store)
+    store.begin_opening()  # the rest is imported meanwhile
+    from appliance.app import main as app
+
     with _start_errors():
-        raise typer.Exit(app.run(settings, context.obj or ()))
+        raise typer.Exit(app.run(settings, context.obj or (), store))
 
 
 @contextmanager

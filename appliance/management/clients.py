@@ -175,7 +175,7 @@ def _entry(session: Session, most: int, room: int) -> tuple[dict[str, Any], int]
         "client": session.client_id,
         "user": identity.username if identity is not None else None,
         "connected": link is not None,
-        "queued": len(session.queue) + len(session.latest) + len(session.large),
+        "queued": session.waiting + len(session.latest) + len(session.large),
         "queued_bytes": session.bytes,
         "inflight": len(session.inflight),
         "will": session.will is not None,

@@ -34,6 +34,9 @@ class SessionStore(Store, Protocol):
     def backlogs(self) -> Backlogs:
         """The backlogs of links to other brokers, from `restore` on."""
 
+    def begin_opening(self) -> None:
+        """Begin what `open` does in a thread; `open` then waits for it."""
+
     def open(self) -> None:
         """Lock and read what the last run has stored.
 

@@ -44,6 +44,7 @@ from appliance.store.rows import (
     SessionRow,
     SubscriptionRow,
     Table,
+    UnreadRows,
 )
 
 log = logging.getLogger("appliance.store")
@@ -70,6 +71,8 @@ class LoadedSession:
     filters: dict[str, int] = field(default_factory=dict)
     inflight: list[int] = field(default_factory=list)
     queue: list[int] = field(default_factory=list)
+    #: The rows of its queue, if they are read later.
+    unread: UnreadRows | None = None
     received: dict[int, int] = field(default_factory=dict)
 
 
@@ -107,11 +110,16 @@ class _WrongRowError(Exception):
     """A row does not mean anything."""
 
 
+#: What is raised where a row is damaged.
+WRONG = (_WrongRowError, TypeError, ValueError, KeyError, IndexError, ProtocolError)
+
+
 def load(rows: Rows, offset: float) -> Loaded:
     """What the rows stand for, with times of the broker's clock; `offset` is as in `rows`."""
     loaded = Loaded()
     keys = [key for table in LOADED for key in rows.of(table)]
     orders = [row.sent for row in rows.owed.values() if isinstance(row.sent, int)]
+    keys.append(rows.unread.last_key)
     loaded.last_key = max((key for key in (*keys, *orders) if 0 < key < LARGEST_KEY), default=0)
     wrong = 0
 
@@ -121,14 +129,7 @@ def load(rows: Rows, offset: float) -> Loaded:
             try:
                 _within(key, 1, LARGEST_KEY)
                 take(found[key])
-            except (
-                _WrongRowError,
-                TypeError,
-                ValueError,
-                KeyError,
-                IndexError,
-                ProtocolError,
-            ) as error:
+            except WRONG as error:
                 log.debug("a row of %s is wrong: %s", table.name.lower(), error)
                 wrong += 1
                 loaded.useless.append((table, key))
@@ -136,7 +137,7 @@ def load(rows: Rows, offset: float) -> Loaded:
     topics: dict[str, bytes] = {}
 
     def take_message(row: MessageRow) -> None:
-        loaded.messages[row.id], expiry = _message(row, offset, topics)
+        loaded.messages[row.id], expiry = message_of(row, offset, topics)
         if expiry is not None:
             loaded.expiries[row.id] = expiry
 
@@ -151,6 +152,13 @@ def load(rows: Rows, offset: float) -> Loaded:
     _sort_inflight(loaded, rows)
     each(Table.RECEIVED, rows.received, lambda row: _take_received(row, loaded))
     each(Table.RETAINED, rows.retained, lambda row: _take_retained(row, loaded))
+    loaded.useless += [(Table.MESSAGE, key) for key in rows.unread.unreferenced]
+    for key, unread in rows.unread.queues.items():
+        if key in loaded.sessions:
+            loaded.sessions[key].unread = unread
+        else:
+            wrong += len(unread)
+            loaded.useless += [(Table.OWED, owed) for owed in unread.keys]
     damaged = [key for key, row in rows.segment.items() if row.length == 0]
     for key in damaged:
         del rows.segment[key]
@@ -214,10 +222,10 @@ def _time(value: object, offset: float) -> float | None:
     return moment - offset
 
 
-def _message(
+def message_of(
     row: MessageRow, offset: float, topics: dict[str, bytes]
 ) -> tuple[Message, int | None]:
-    """The message, and its message expiry interval if it was stored as a will.
+    """The message, and its message expiry interval if it was stored as a will; raises `WRONG`.
 
     Most messages have the topic of another one: `topics` saves to check and to encode it again.
     """
@@ -309,22 +317,27 @@ def _take_owed(row: OwedRow, loaded: Loaded) -> None:
         saved.inflight[_within(packet_id, 1, 0xFFFF)] = None
         session.inflight.append(row.id)
         return
-    ids = None if row.subscription_ids is None else json.loads(_of(str, row.subscription_ids))
-    if ids is not None:
-        ids = [_within(number, 1, 268_435_455) for number in _of(list, ids)]
-    pending = PendingDelivery(
-        loaded.messages[_of(int, row.message)],
-        _within(row.qos, 1, 2),
-        _within(row.retain, 0, 1) == 1,
-        ids,
-        None if row.share is None else _of(str, row.share),
-    )
+    pending = pending_of(row, loaded.messages[_of(int, row.message)])
     if packet_id is None:
         saved.queue.append(pending)
         session.queue.append(row.id)
     else:
         saved.inflight[packet_id] = pending
         session.inflight.append(row.id)
+
+
+def pending_of(row: OwedRow, message: Message) -> PendingDelivery:
+    """A message on its way to a session; raises `WRONG`."""
+    ids = None if row.subscription_ids is None else json.loads(_of(str, row.subscription_ids))
+    if ids is not None:
+        ids = [_within(number, 1, 268_435_455) for number in _of(list, ids)]
+    return PendingDelivery(
+        message,
+        _within(row.qos, 1, 2),
+        _within(row.retain, 0, 1) == 1,
+        ids,
+        None if row.share is None else _of(str, row.share),
+    )
 
 
 def _take_received(row: ReceivedRow, loaded: Loaded) -> None:

@@ -29,6 +29,9 @@ class MemoryStore(StoreState):
     def __init__(self) -> None:
         super().__init__(size=1 << 62)  # only the broker's own limits apply
 
+    def begin_opening(self) -> None:
+        """See `SessionStore`; there is nothing to read."""
+
     def open(self) -> None:
         """See `SessionStore`; there is nothing to read."""
 

@@ -8,12 +8,8 @@ from appliance.broker.accounts import Account
 from appliance.broker.message import Message
 from appliance.store.clock import StoreClock
 from appliance.store.committer import Committer
-from appliance.store.rows import Table, message_row
+from appliance.store.rows import MESSAGE_OVERHEAD, Table, message_row
 from appliance.store.state import StoreState
-
-#: Bytes that a message takes in the database beside its topic, payload and properties, roughly,
-#: including the rows of what it is delivered to.
-MESSAGE_OVERHEAD = 120
 
 
 class _StoredMessage:
@@ -41,8 +37,9 @@ class StoredMessages:
         self._state = state
         self._committer = committer
         self._clock = clock
-        #: The oldest first, as keys grow.
+        #: The oldest first, as keys grow, when `_is_in_order`.
         self._messages: dict[Message, _StoredMessage] = {}
+        self._is_in_order = True
 
     def __len__(self) -> int:
         return len(self._messages)
@@ -57,6 +54,22 @@ class StoredMessages:
         stored = self._messages[message]
         stored.references += 1
         account.stored += stored.size
+
+    def hold(self, message: Message) -> None:
+        """Keep a stored message until `let_go`: rows refer to it that were not read yet."""
+        self._messages[message].references += 1
+
+    def let_go(self, message: Message) -> None:
+        """The opposite of `hold`."""
+        self._let_go(message, self._messages[message])
+
+    def size(self, message: Message) -> int:
+        """Bytes that are counted for a stored message."""
+        return self._messages[message].size
+
+    def lose_order(self) -> None:
+        """Messages were loaded in another order than that of their keys."""
+        self._is_in_order = False
 
     def put(self, message: Message, account: Account, expiry: int | None = None) -> int:
         """Count one more row that refers to the message, which is stored if it was not.
@@ -88,8 +101,11 @@ class StoredMessages:
     def release(self, message: Message, account: Account) -> None:
         """Count one row less that refers to the message, and delete it after the last."""
         stored = self._messages[message]
-        stored.references -= 1
         account.stored -= stored.size
+        self._let_go(message, stored)
+
+    def _let_go(self, message: Message, stored: _StoredMessage) -> None:
+        stored.references -= 1
         if not stored.references:
             self._delete(message)
 
@@ -106,6 +122,10 @@ class StoredMessages:
 
     def older_than(self, seconds: float) -> Callable[[Message], bool] | None:
         """A test for messages that were stored before so many seconds; None when there are none."""
+        if not self._is_in_order:
+            in_order = sorted(self._messages.items(), key=lambda item: item[1].key)
+            self._messages = dict(in_order)
+            self._is_in_order = True
         limit = self._clock.now() - seconds
         oldest = next(iter(self._messages.values()), None)
         if oldest is None or oldest.stored_at >= limit:

@@ -15,7 +15,7 @@ from typing import TypeAlias
 from appliance.broker.backlogs import RecordsLostError
 from appliance.net.callbacks import Entries
 from appliance.store.records import split
-from appliance.store.schema import BUSY_TIMEOUT, is_damage
+from appliance.store.schema import connect_beside, is_damage
 
 #: Segments that are read or have been read, and whose records the event loop has not taken yet.
 #: The others wait, so that a busy loop does not let records pile up.
@@ -111,7 +111,7 @@ class Reader:
             outcome: list[bytes] | Exception
             try:
                 if connection is None:
-                    connection = _connect(self._path)
+                    connection = connect_beside(self._path)
                 outcome = _read(connection, reading.keys)
             except Exception as error:  # whatever it is, the thread has to continue
                 outcome = error
@@ -129,16 +129,6 @@ class Reader:
                 )
         if connection is not None:
             connection.close()
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    return sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode=ro",
-        uri=True,
-        timeout=BUSY_TIMEOUT,
-        isolation_level=None,
-        check_same_thread=False,
-    )
 
 
 def _read(connection: sqlite3.Connection, keys: list[int]) -> list[bytes]:

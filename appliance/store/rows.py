@@ -11,13 +11,16 @@ broker's clock.
 from __future__ import annotations
 
 import json
+from array import array
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias, cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.delivery import Delivery, UnreleasedPublish
-from appliance.broker.message import Message
+from appliance.broker.message import OVERHEAD, Message
 from appliance.broker.shared import Share
 from appliance.broker.store import SessionState
 from appliance.mqtt.codec import (
@@ -186,6 +189,53 @@ class LatestRow(NamedTuple):
     record: Value
 
 
+#: Bytes that a message takes in the database beside its topic, payload and properties, roughly,
+#: including the rows of what it is delivered to.
+MESSAGE_OVERHEAD = 120
+
+#: The condition on rows of `owed` that may be read later: queued, and not obviously damaged.
+MAY_WAIT = (
+    "packet_id IS NULL AND id BETWEEN 1 AND 4503599627370496 "
+    "AND typeof(session) = 'integer' AND typeof(message) = 'integer'"
+)
+
+#: Bytes of a message in the database.
+_SIZE = (
+    f"length(CAST(topic AS BLOB)) + 2 + length(payload) + {MESSAGE_OVERHEAD} "
+    f"+ coalesce(length(properties), {len(NO_PROPERTIES)})"
+)
+
+#: The keys of all messages, and their bytes.
+SIZES = f"SELECT id, coalesce({_SIZE}, 0) FROM message"
+
+#: How many messages there are, and their bytes.
+STORED = f"SELECT count(*), total({_SIZE}) FROM message"
+
+#: What has to be known of each queue before its rows are read: the keys, the bytes in the store,
+#: and about what `Message.size` has for each, too (a topic that is not ASCII takes two bytes a
+#: character). The limit keeps SQLite from sorting the payloads in place of their lengths.
+QUEUES = f"""
+    SELECT session, group_concat(id), group_concat(message), max(is_shared), total(size),
+        total(size + text)
+    FROM (
+        SELECT waiting.id, session, waiting.message, share IS NOT NULL AS is_shared,
+            {_SIZE} AS size,
+            {OVERHEAD - MESSAGE_OVERHEAD} + length(CAST(topic AS BLOB)) + 4 + length(topic)
+            + CASE length(topic) WHEN length(CAST(topic AS BLOB)) THEN 0 ELSE 76 + length(topic) END
+            AS text
+        FROM (SELECT id, session, message, share FROM owed WHERE {MAY_WAIT}) AS waiting
+        LEFT JOIN message ON message.id = waiting.message
+        ORDER BY session LIMIT -1
+    )
+    GROUP BY session
+"""
+
+#: The messages of some rows, each with its bytes; what is selected follows.
+MESSAGES_OF = f"""
+    SELECT owed.id, message.id, {_SIZE}
+    FROM owed JOIN message ON message.id = owed.message WHERE owed.id
+"""
+
 #: The named tuple of each table. A column that an older version of the tables does not have is at
 #: the end and has a default.
 ROW_TYPES: dict[Table, type[NamedTuple]] = {
@@ -204,6 +254,57 @@ ROW_TYPES: dict[Table, type[NamedTuple]] = {
 COLUMNS: dict[Table, tuple[str, ...]] = {table: ROW_TYPES[table]._fields for table in Table}
 
 
+class UnreadRows:
+    """What is known of the rows of a session's queue without reading them."""
+
+    __slots__ = ("bytes", "is_shared", "keys", "next", "size")
+
+    def __init__(self, keys: array[int], *, is_shared: bool, size: int, queued: int) -> None:
+        #: In their order.
+        self.keys = keys
+        #: The index of the first one that was not read yet.
+        self.next = 0
+        #: Whether any has a group.
+        self.is_shared = is_shared
+        #: Bytes of the messages in the store, and about what the broker counts for them.
+        self.size = size
+        self.bytes = queued
+
+    def __len__(self) -> int:
+        return len(self.keys) - self.next
+
+
+@dataclass(slots=True)
+class Unread:
+    """The queues of sessions whose rows are read later, and the messages that they refer to."""
+
+    #: By the keys of the sessions.
+    queues: dict[int, UnreadRows] = field(default_factory=dict)
+    #: By the keys of messages: how many of the rows refer to it.
+    references: Counter[int] = field(default_factory=Counter)
+    #: Bytes of all messages in the store, with those that are read at the start.
+    stored: int = 0
+    #: The keys of messages that nothing refers to, which only damage can leave there.
+    unreferenced: list[int] = field(default_factory=list)
+    #: The largest key of a row or a message.
+    last_key: int = 0
+
+    def add(self, found: Iterable[Row]) -> None:
+        """Take what `QUEUES` selects."""
+        for session, keys, messages, is_shared, size, queued in found:
+            # One after the other most often already, but SQLite does not promise it.
+            own = array("q", sorted(map(int, cast(str, keys).split(","))))
+            referred = list(map(int, cast(str, messages).split(",")))
+            self.references.update(referred)
+            self.last_key = max(self.last_key, own[-1], *referred)
+            self.queues[cast(int, session)] = UnreadRows(
+                own,
+                is_shared=bool(is_shared),
+                size=int(cast(float, size)),
+                queued=int(cast(float, queued)),
+            )
+
+
 @dataclass(slots=True)
 class Rows:
     """All rows of the tables in `LOADED` by their keys; the fields are named as the tables."""
@@ -217,6 +318,8 @@ class Rows:
     clock: dict[int, ClockRow] = field(default_factory=dict)
     segment: dict[int, SegmentRow] = field(default_factory=dict)
     latest: dict[int, LatestRow] = field(default_factory=dict)
+    #: What is read later is in none of these.
+    unread: Unread = field(default_factory=lambda: Unread())
 
     def of(self, table: Table) -> dict[int, Row]:
         """The rows of one table."""

@@ -44,7 +44,7 @@ def salvage(path: Path) -> Rows:
                 # From both ends, up to the damage.
                 for order in ("ASC", "DESC"):
                     with contextlib.suppress(*_UNREADABLE):
-                        for key, row in read_table(connection, table, order):
+                        for key, row in read_table(connection, table, f"ORDER BY id {order}"):
                             rows.of(table).setdefault(key, row)
         if any(map(rows.of, LOADED)):
             break  # reading it without its log as well would mix in an older state

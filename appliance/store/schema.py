@@ -10,12 +10,12 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from appliance.store.rows import COLUMNS, LOADED, ROW_TYPES, Row, Table
+from appliance.store.rows import COLUMNS, LOADED, ROW_TYPES, Row, Table, Value
 
 Durability: TypeAlias = Literal["power", "process", "off"]
 
@@ -213,6 +213,21 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True, timeout=BUSY_TIMEOUT)
 
 
+def connect_beside(path: Path) -> sqlite3.Connection:
+    """Open the database to read it beside the writer, who does not have to wait (WAL).
+
+    Raises:
+        sqlite3.Error: it cannot be opened.
+    """
+    return sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode=ro",
+        uri=True,
+        timeout=BUSY_TIMEOUT,
+        isolation_level=None,
+        check_same_thread=False,
+    )
+
+
 def _migrate(connection: sqlite3.Connection, path: Path) -> None:
     """Bring the tables up to date in a transaction that the first batch commits.
 
@@ -282,9 +297,11 @@ def delete(table: Table, count: int) -> str:
 
 
 def read_table(
-    connection: sqlite3.Connection, table: Table, order: str = ""
+    connection: sqlite3.Connection, table: Table, rest: str = "", values: Sequence[Value] = ()
 ) -> Iterator[tuple[int, Row]]:
-    """All rows of a table, as named tuples, with their keys; `order` is ASC or DESC, by key.
+    """All rows of a table, as named tuples, with their keys.
+
+    `rest` is what follows in the statement, which selects or orders the rows, with its `values`.
 
     Raises:
         sqlite3.Error, UnicodeError, OverflowError: it cannot be read.
@@ -304,7 +321,5 @@ def read_table(
         raise DamagedError(f"the table {name} has lost columns") from None
     # Without the named tuple's own `__new__`, which takes as long as half of the reading.
     make: Callable[[Row], Row] = partial(tuple.__new__, kind)
-    for row in connection.execute(
-        f"SELECT {columns} FROM {name}" + (f" ORDER BY id {order}" if order else "")
-    ):
+    for row in connection.execute(f"SELECT {columns} FROM {name} {rest}", values):
         yield row[0], make(row)

@@ -19,6 +19,7 @@ from appliance.store.loader import Loaded, load
 from appliance.store.rows import LOADED, Rows, Table
 from appliance.store.schema import Durability
 from appliance.store.staging import StagingStore, StoredSession
+from appliance.store.unread import UnreadQueue, UnreadQueues
 
 log = logging.getLogger("appliance.store")
 
@@ -52,6 +53,8 @@ class SqliteStore(StagingStore):
         #: The batch that the clock's stamp was last put into.
         self._stamped = 0
         self._clock_check: PeriodicCallback | None = None
+        #: What the start has left to be read, if there was much.
+        self._unread: UnreadQueues | None = None
 
     @property
     def path(self) -> Path:
@@ -68,6 +71,10 @@ class SqliteStore(StagingStore):
         """What was committed since the start."""
         return self._committer.metrics
 
+    def begin_opening(self) -> None:
+        """Begin to read the database beside the start; `open` follows."""
+        self._database.begin_opening()
+
     def open(self) -> None:
         """See `SessionStore`."""
         self._database.open()
@@ -83,6 +90,8 @@ class SqliteStore(StagingStore):
         for key, message in loaded.messages.items():
             stored_at = cast(float, rows.message[key].stored_at)
             self._messages.load(key, message, stored_at)
+        if rows.unread.queues:
+            self._unread = self._leave_unread(loaded, rows)
         self._restore_retained(broker, loaded)
         restore(
             broker,
@@ -101,17 +110,22 @@ class SqliteStore(StagingStore):
         if contents.salvaged and not contents.problem:
             self._committer.commit()
         self._clock_check = entries.every("store.clock", CLOCK_CHECK, self._check_clock)
+        later = len(self._unread) if self._unread is not None else 0
         if loaded.sessions or loaded.retained:
             log.info(
-                "%d sessions, %d messages and %d retained messages restored from %s",
+                "%d sessions, %d messages and %d retained messages restored from %s%s",
                 sum(1 for session in loaded.sessions.values() if session.saved.expiry),
-                sum(
+                later
+                + sum(
                     len(session.inflight) + len(session.queue) + len(session.received)
                     for session in loaded.sessions.values()
                 ),
                 len(loaded.retained),
                 self.path,
+                f"; {later} of the messages are read while clients are served" if later else "",
             )
+        if self._unread is not None:
+            self._unread.start(entries, broker.router.shares.get)
 
     def _prepare_batch(self, contents: Contents, next_key: int) -> None:
         """Begin the first batch, with what is not in the database yet."""
@@ -121,6 +135,22 @@ class SqliteStore(StagingStore):
             for table in LOADED:
                 committer.open.rows[table].update(contents.rows.of(table))
         self._put_stamp()
+
+    def _leave_unread(self, loaded: Loaded, rows: Rows) -> UnreadQueues:
+        """Give the sessions the rows that are read later."""
+        unread = UnreadQueues(
+            self.path,
+            loaded,
+            rows.unread,
+            self._clock.offset,
+            self,
+            self._messages,
+            self._committer,
+        )
+        for session in loaded.sessions.values():
+            if session.unread is not None:
+                session.saved.unread = unread.add(session.unread)
+        return unread
 
     def _restore_retained(self, broker: Broker, loaded: Loaded) -> None:
         accounts = broker.accounting.accounts
@@ -140,6 +170,8 @@ class SqliteStore(StagingStore):
             session = entry.saved.session
             assert session is not None
             stored = self._sessions[session] = StoredSession(entry.key, session.account)
+            if self._unread is not None and isinstance(entry.saved.unread, UnreadQueue):
+                self._unread.attach(entry.saved.unread, session, stored)
             stored.filters = entry.filters
             inflight = zip(entry.inflight, session.inflight.items(), strict=True)
             for key, (packet_id, delivery) in inflight:
@@ -164,6 +196,8 @@ class SqliteStore(StagingStore):
         """See `SessionStore`."""
         if self._clock_check is not None:
             self._clock_check.cancel()
+        if self._unread is not None:
+            self._unread.stop()
         await self.backlogs.stop_reading()  # or the writer could not empty the write-ahead log
         await self._committer.stop(self._put_stamp)
         self._database.close()

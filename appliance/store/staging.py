@@ -31,7 +31,16 @@ from appliance.store.state import StoreState
 class StoredSession:
     """The keys of a session's rows, and the account that its messages are counted in."""
 
-    __slots__ = ("account", "filters", "key", "owed", "received", "recorded", "will")
+    __slots__ = (
+        "account",
+        "drop_unread",
+        "filters",
+        "key",
+        "owed",
+        "received",
+        "recorded",
+        "will",
+    )
 
     def __init__(self, key: int, account: Account) -> None:
         self.key = key
@@ -45,6 +54,8 @@ class StoredSession:
         #: By packet id: QoS 2 messages that wait for PUBREL.
         self.received: dict[int, tuple[int, Message]] = {}
         self.will: Message | None = None
+        #: Deletes the rows of its queue that were not read since the start, if there were any.
+        self.drop_unread: Callable[[], None] | None = None
 
 
 class StagingStore(StoreState):
@@ -75,6 +86,8 @@ class StagingStore(StoreState):
 
     def session_saved(self, session: SessionState) -> None:
         """See `Store`; a session without expiry is stored while it has a will, for the will."""
+        if not session.expiry:
+            session.read_all()  # its client gets them, and they are no longer stored
         if not session.expiry and session.will is None:
             self.session_removed(session)
             return
@@ -122,6 +135,8 @@ class StagingStore(StoreState):
     def _drop_contents(self, stored: StoredSession) -> None:
         """Delete everything of a session except itself and its will."""
         batch = self._committer.open
+        if stored.drop_unread is not None:
+            stored.drop_unread()
         for key in stored.filters.values():
             batch.remove(Table.SUBSCRIPTION, key)
         for key, delivery, _ in stored.owed.values():

@@ -27,6 +27,8 @@ class Harness:
         self.path = directory / "state/store.db"
         self.limits = limits or Limits()
         self.options = options
+        #: Whether a start reads what it could leave for later.
+        self.reads_all = True
 
     def start(self) -> Harness:
         self.store = SqliteStore(self.path, **{"durability": "process", **self.options})
@@ -35,6 +37,9 @@ class Harness:
         self.broker = Broker(self.access, self.store, self.limits)
         self.tick()
         self.store.restore(self.broker)
+        if self.reads_all:
+            for session in list(self.broker.sessions.values()):
+                session.read_all()
         return self
 
     def tick(self, ahead: float = 0.0) -> None:
@@ -66,6 +71,7 @@ class Harness:
     def copy(self, directory: Path) -> Harness:
         """Not started, with what would be stored if the process had been killed now."""
         copy = Harness(directory, self.limits, **self.options)
+        copy.reads_all = self.reads_all
         copy.path.parent.mkdir(parents=True)
         for name in (self.path.name, f"{self.path.name}-wal"):
             if (self.path.parent / name).exists():

@@ -34,11 +34,18 @@ from appliance.mqtt.packets import (
     Will,
 )
 from appliance.mqtt.reason import ReasonCode
+from appliance.store import database
 from appliance.store.inspection import summarise
 from store.harness import Harness, difference, state
 
 #: By a clock that is right.
 YEAR_2030 = 1_900_000_000.0
+
+
+@pytest.fixture(params=[database.AT_START, -1], ids=["at once", "later"], autouse=True)
+def at_start(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Queues are read at the start, and are left to be read later."""
+    monkeypatch.setattr(database, "AT_START", request.param)
 
 
 @pytest_asyncio.fixture
