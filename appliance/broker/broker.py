@@ -806,8 +806,9 @@ class Broker:
 
     def _count_checks(self, route: Fanout) -> None:
         """Add the cost of checking each receiver of a route."""
-        checks = len(route.targets) + sum(len(members) for _, members in route.shares)
-        checks += len(route.rated)
+        checks = len(route.targets) + len(route.rated)
+        for _, members in route.shares:
+            checks += len(members)
         self.counters.cost += checks // CHECKS_PER_COST_UNIT
 
     def must_store(self, route: Fanout, message: Message, origin: Session) -> bool:
@@ -857,7 +858,9 @@ class Broker:
                 session.deliver_promised(Delivery(message, qos, retain, ids, share))
             else:
                 shares.append((share, members))
-        self.publish_to(targets, replace(route, shares=shares), message, origin)
+        if route.shares:  # a copy of the route costs as much as all the rest
+            route = replace(route, shares=shares)
+        self.publish_to(targets, route, message, origin)
 
     def refuse_publish(self, session: Session, route: Fanout, message: Message) -> None:
         """Count and log that the session may not publish the message to the route's topic."""

@@ -90,15 +90,20 @@ def test_one_full_queue_does_not_keep_a_message_from_the_others(join: Join):
 
 
 @pytest.mark.parametrize("limits", [Limits(**SMALL)])
-def test_what_pubrec_took_is_kept_though_the_queue_filled_meanwhile(join: Join):
+@pytest.mark.parametrize("topic_filter", ["a", "$share/g/a"])
+def test_what_pubrec_took_is_kept_though_the_queue_filled_meanwhile(
+    join: Join, broker: Broker, topic_filter
+):
     subscriber = join("subscriber")
-    subscriber.subscribe("a", 2)
+    subscriber.subscribe(topic_filter, 2)
     promised = join("promised")
     promised.send(Publish("a", b"promised", 2, packet_id=1))
     assert promised.received()[0].reason_code == 0  # type: ignore[union-attr]
     assert fill(join("publisher"), 5)[-1] == 0x97
+    dropped = dict(broker.counters.dropped)
     promised.send(bytes.fromhex("62 02 0001"))
-    assert b"promised" in [m.payload for m in subscriber.drain()]
+    assert [m.payload for m in subscriber.drain()].count(b"promised") == 1
+    assert broker.counters.dropped == dropped
 
 
 def test_a_line_has_the_name_of_who_logs(caplog: pytest.LogCaptureFixture):
