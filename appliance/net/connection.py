@@ -21,7 +21,7 @@ from typing import cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.client import ClientHandler
-from appliance.broker.inflow import PAUSE_BEHIND
+from appliance.broker.inflow import PAUSE, PAUSE_BEHIND
 from appliance.broker.limits import USUAL_TERMS, Terms
 from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.broker.ports import Exchange
@@ -136,6 +136,7 @@ class ClientConnection:
             None  # for the next look whether it has caught up
         )
         self._look_at = 0.0
+        self._looked_at = -math.inf  # the last look
         self._input_blocked = False
         self._logging_in = False
         self._login_result: Identity | Refusal | None = None  # the client has not been told yet
@@ -525,6 +526,7 @@ class ClientConnection:
             # is written, it cannot be distinguished from what has come during the login: so check
             # now whether anything has, unless some of it is buffered here already.
             if not (self._client.protocol.has_unparsed or self._backlog):
+                self._looked_at = -math.inf
                 self.input_resumed()
                 self.input_paused()
             self._answer_connect(who)
@@ -550,10 +552,15 @@ class ClientConnection:
 
     def input_resumed(self) -> None:
         """Nothing that was received waits any more."""
-        inflow = self._client.inflow
-        inflow.reading_resumed(self._loop.time())
+        inflow, now = self._client.inflow, self._loop.time()
+        inflow.reading_resumed(now)
         if inflow.is_behind:
-            self._check_caught_up()
+            # While much comes that is after each chunk, and to ask the system each time takes as
+            # long as to pass on 30 KB. What is kept back for so short a time is too young to matter.
+            if now - self._looked_at > PAUSE:
+                self._check_caught_up()
+            else:
+                self._schedule_look(PAUSE)
 
     def _check_caught_up(self) -> None:
         """Check, now and later, whether all is read that came while reading was paused."""
@@ -562,9 +569,10 @@ class ClientConnection:
         known = receive_buffer(self._transport.get_extra_info("socket"))
         if self._transport.get_extra_info("has_unread"):
             known = known._replace(unread=True)
-        inflow = self._client.inflow
-        seconds = inflow.check(self._loop.time(), **known._asdict())
-        if seconds:
+        inflow, now = self._client.inflow, self._loop.time()
+        seconds = inflow.check(now, **known._asdict())
+        if seconds:  # else it has caught up, or is not read again
+            self._looked_at = now
             self._schedule_look(seconds)
 
     def _schedule_look(self, seconds: float) -> None:

@@ -13,10 +13,11 @@ from harness import Harness, PublishObserver
 from test_websocket import frame, receive_frame, shake_hands
 from waiting import PATIENCE, until
 
+from appliance.broker.inflow import PAUSE
 from appliance.broker.link import LOCAL_PEER, PeerStatus
 from appliance.mqtt.packets import Connect, Pingreq, Pingresp, Publish, Subscribe, Subscription
 from appliance.net import connection as wire_module
-from appliance.net.connection import ClientConnection
+from appliance.net.connection import LARGE_CHUNK, ClientConnection
 from appliance.net.sockets import Probe, peer_status, receive_buffer
 
 HOST = "127.0.0.1"
@@ -270,6 +271,31 @@ async def test_what_a_far_client_kept_back_is_not_new(harness, monkeypatch, webs
     send(Publish("x", b"new").encode(5))
     await until(lambda: len(held) == 701)
     assert held[-1] == 0
+
+
+async def test_while_much_comes_the_system_is_not_asked_after_each_chunk(harness, monkeypatch):
+    """Nor too rarely: whoever is behind is looked at again soon."""
+    looks, chunks = [], []
+    loop = asyncio.get_running_loop()
+
+    def look(sock):
+        looks.append(loop.time())
+        return receive_buffer(sock)
+
+    monkeypatch.setattr(wire_module, "receive_buffer", look)
+    peer = await harness.log_in("a")
+    wire = harness.protocol("a")
+    PublishObserver(harness, lambda _: chunks.append(loop.time()))
+    large = Publish("x", bytes(LARGE_CHUNK)).encode(5)
+    wire._rest(0.01)
+    began = loop.time()
+    for _ in range(500):
+        peer.writer.write(large)
+        await peer.writer.drain()
+    await until(lambda: len(chunks) == 500)
+    took = loop.time() - began
+    assert 1 <= len(looks) <= 3 + 2 * took / PAUSE
+    await until(lambda: not wire._client.inflow.is_behind, "a look by itself")
 
 
 async def test_who_streams_on_is_new_again_after_a_pause(harness):
