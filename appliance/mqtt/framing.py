@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from enum import Enum
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from appliance.mqtt.codec import PacketType, Property, decode_varint, text_size
 from appliance.mqtt.packets import Packet, Publish, decode_packet
@@ -41,17 +41,20 @@ UNAUTHENTICATED_PAIRS = 64
 #: The default limit of User Properties in a packet after the login.
 DEFAULT_PAIRS = 1000
 
-PUBACK = PacketType.PUBACK << 16
-PUBREC = PacketType.PUBREC << 16
-PUBREL = PacketType.PUBREL << 16
-PUBCOMP = PacketType.PUBCOMP << 16
+PUBACK: Final = 4 << 16
+PUBREC: Final = 5 << 16
+PUBREL: Final = 6 << 16
+PUBCOMP: Final = 7 << 16
 
 # First byte of an acknowledgement -> its event without the packet id.
-_ACKNOWLEDGEMENTS = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
+_ACKNOWLEDGEMENTS: Final = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
 
 
 #: A buffered chunk below this size, in bytes, is joined with the next one immediately.
-SMALL_CHUNK = 4096
+SMALL_CHUNK: Final = 4096
+
+#: A PUBLISH of at least this size, in bytes, is not joined before its payload is cut out.
+LARGE_PACKET: Final = 16 * 1024
 
 #: The memory of a topic alias beside its topic, in bytes.
 ALIAS_SIZE = 150
@@ -188,6 +191,7 @@ class PacketFramer:
 
     def _parse(self, data: bytes) -> Iterator[Event]:
         """The general form of `receive_data`."""
+        pos = 0
         if self._have:
             # The chunks of a packet are joined once, when it is complete: joining at every chunk
             # would copy a 16 MiB packet a hundred times. Small chunks are joined immediately,
@@ -199,12 +203,19 @@ class PacketFramer:
             self._have += len(data)
             if self._have < self._need or not self._reading:
                 return
-            buf = b"".join(self._chunks)
+            scattered = self._scattered()
+            if scattered is not None:
+                # What the last chunk has behind the packet is parsed where it is.
+                buf = self._chunks[-1]
+                pos = len(buf) - (self._have - self._need)
+            else:
+                buf = b"".join(self._chunks)
             self._chunks.clear()
             self._have = 0
+            if scattered is not None:
+                yield scattered
         else:
             buf = data
-        pos = 0
         end = len(buf)
         need = 2  # bytes of the packet at `pos`, as far as known
         try:
@@ -245,37 +256,10 @@ class PacketFramer:
                     need = stop - pos
                     break
                 if 0x30 <= first <= 0x3D and length > 4:
-                    # The data path: a PUBLISH is parsed by index. One with properties, without a
-                    # topic or with invalid flags goes to the full decoder.
-                    topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
-                    payload = topic_end
-                    packet_id = 0
-                    if first & 6:
-                        payload += 2
-                        if payload <= stop:
-                            packet_id = buf[topic_end] << 8 | buf[topic_end + 1]
-                    if self.version == 5:
-                        payload += 1
-                    if (
-                        payload > stop
-                        or (self.version == 5 and buf[payload - 1])
-                        or topic_end == body + 2
-                        or (not packet_id if first & 6 else first & 8)
-                        or first & 6 == 6
-                    ):
-                        yield self._publish(first, buf[body:stop])
-                    else:
-                        self._head_first = first
-                        self._head = head = buf[pos:topic_end]
-                        self._head_topic = buf[body:topic_end]
-                        self._head_size = stop - pos
-                        yield (
-                            first,
-                            self._head_topic,
-                            packet_id,
-                            buf[payload:stop],
-                            head if packet_id else buf[pos:stop],
-                        )
+                    event = None
+                    if self._learn(buf, pos, body, stop):
+                        event = self._repeated(buf, pos, stop)
+                    yield event if event is not None else self._publish(first, buf[body:stop])
                 else:
                     self._check(first, stop - pos)
                     yield self._decode(first, buf[body:stop])
@@ -289,6 +273,30 @@ class PacketFramer:
             self._chunks.append(buf[pos:] if pos else buf)
             self._have = end - pos
             self._need = need
+
+    def _learn(self, buf: bytes, pos: int, body: int, stop: int) -> bool:
+        """Note the header and topic of a PUBLISH for `_repeated`; False if it needs the full
+        decoder.
+
+        The data path: it is parsed by index. One with properties, without a topic or with invalid
+        flags goes to the full decoder. Its bytes must be there up to its payload.
+        """
+        first = buf[pos]
+        topic_end = body + 2 + (buf[body] << 8 | buf[body + 1])
+        payload = topic_end + (2 if first & 6 else 0) + (self.version == 5)
+        if (
+            payload > stop
+            or (self.version == 5 and buf[payload - 1])
+            or topic_end == body + 2
+            or first & 6 == 6
+            or first & 14 == 8
+        ):
+            return False
+        self._head_first = first
+        self._head = buf[pos:topic_end]
+        self._head_topic = buf[body:topic_end]
+        self._head_size = stop - pos
+        return True
 
     def _repeated(self, buf: bytes, pos: int, stop: int) -> RawPublish | None:
         """A PUBLISH with the header and topic of the last; None if it needs the full decoder."""
@@ -312,6 +320,35 @@ class PacketFramer:
             buf[payload:stop],
             head if packet_id else buf[pos:stop],
         )
+
+    def _scattered(self) -> RawPublish | None:
+        """The large PUBLISH that the buffered chunks complete; None if it takes another way.
+
+        Its payload is joined out of the chunks. To join the chunks first, and cut the payload out
+        of that, would copy each byte once more, and with it what is behind the packet.
+        """
+        chunks, size = self._chunks, self._need
+        buf, last = chunks[0], chunks[-1]
+        behind = self._have - size  # bytes of the last chunk
+        first = buf[0]
+        if size < LARGE_PACKET or len(chunks) == 1 or behind >= len(last) or first >> 4 != 3:
+            return None
+        if size != self._head_size or not buf.startswith(self._head):
+            body = decode_varint(buf, 1)[1]
+            known = len(buf) - body - 5  # most bytes of a topic of which all is there
+            if known < 0 or known < buf[body] << 8 | buf[body + 1]:
+                return None
+            if not self._learn(buf, 0, body, size):
+                return None
+        start = len(self._head) + (2 if first & 6 else 0) + (self.version == 5)
+        event = self._repeated(buf, 0, start) if len(buf) >= start else None
+        if event is None:
+            return None
+        parts: list[bytes | memoryview] = [memoryview(buf)[start:], *chunks[1:-1]]
+        parts.append(memoryview(last)[: len(last) - behind])
+        payload = b"".join(parts)
+        _, topic, packet_id, _, head = event
+        return first, topic, packet_id, payload, head if packet_id else head + payload
 
     def _check(self, first: int, size: int) -> None:
         """Raise ProtocolError if a packet of this type or size is not allowed now."""

@@ -17,7 +17,7 @@ import ssl
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import cast
+from typing import Final, cast
 
 from appliance.broker.accounts import Account
 from appliance.broker.client import ClientHandler
@@ -49,12 +49,15 @@ OUTPUT_LOW_WATER = 16 * 1024
 SYSTEM_OUTPUT = 128 * 1024
 
 #: The most bytes that a transport is given at once: of a large message it holds a part, not a copy.
-WRITE_PORTION = 512 * 1024
+WRITE_PORTION: Final = 512 * 1024
+
+#: Bytes of a payload from which on it is not joined with its header, nor with other packets.
+LARGE_PAYLOAD: Final = 4 * 1024
 
 #: A chunk this large means that more is waiting. The loop would read up to 32 such chunks before it
 #: writes; reading is paused for the rest of the round, so that the receivers are written to before
 #: they count as slow.
-LARGE_CHUNK = 128 * 1024
+LARGE_CHUNK: Final = 128 * 1024
 
 #: A chunk of at most this many bytes is small; a client that sends more may have to wait for a
 #: turn.
@@ -556,7 +559,7 @@ class ClientConnection:
         inflow.reading_resumed(now)
         if inflow.is_behind:
             # While much comes that is after each chunk, and to ask the system each time takes as
-            # long as to pass on 30 KB. What is kept back for so short a time is too young to matter.
+            # long as to pass on 30 KB. What is kept back between two looks is young enough.
             if now - self._looked_at > PAUSE:
                 self._check_caught_up()
             else:
@@ -867,6 +870,14 @@ class ClientConnection:
     def write(self, chunks: list[bytes]) -> None:
         """Write the chunks, joined if they are small; to a slow client in portions."""
         if not self._paused:
+            if len(chunks[-1]) > LARGE_PAYLOAD and len(chunks) > 1:
+                size = sum(map(len, chunks))
+                if len(chunks) * LARGE_PAYLOAD < size <= WRITE_PORTION:
+                    # Not joined, which copies them: the system takes them one after the other.
+                    self._counters.bytes_sent += size
+                    if self._transport is not None:
+                        self._transport.writelines(chunks)
+                    return
             data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
             size = len(data)
             if size <= WRITE_PORTION:

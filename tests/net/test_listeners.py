@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import random
 import re
 import resource
 import socket
@@ -84,6 +85,32 @@ async def test_a_message_goes_from_one_client_to_another(harness: Harness, tls):
         heard = await subscriber.receive()
         assert isinstance(heard, Publish) and len(heard.payload) == size
         await subscriber.send(Puback(heard.packet_id or 0))
+
+
+@both
+async def test_payloads_large_and_small_arrive_in_order(harness: Harness, tls):
+    """Small ones are joined with what is around them, large ones are not."""
+    await harness.start()
+    subscriber = await harness.log_in("subscriber", tls=tls)
+    await subscriber.send(Subscribe(1, [Subscription("a", 1)]))
+    assert await subscriber.receive() == Suback(1, [1])
+    large = 3 * wire.LARGE_PAYLOAD
+    sizes = [0, 10, 5000, 10, large, 100_000, 100_000, 10, 0, 200_000, wire.WRITE_PORTION]
+    said = [
+        Publish("a", random.randbytes(size), 1, packet_id=number)
+        for number, size in enumerate(sizes, 1)
+    ]
+    publisher = await harness.log_in("publisher", tls=tls)
+    before = harness.broker.counters.bytes_sent
+    for start in (0, 4, 6):
+        await publisher.send(*said[start:])
+        for packet in said[start:]:
+            assert await publisher.receive() == Puback(packet.packet_id)
+            heard = await subscriber.receive()
+            assert isinstance(heard, Publish) and heard.payload == packet.payload
+            await subscriber.send(Puback(heard.packet_id))
+    sent = sum(len(packet.encode(5)) + 4 for start in (0, 4, 6) for packet in said[start:])
+    assert harness.broker.counters.bytes_sent == before + sent
 
 
 @both
