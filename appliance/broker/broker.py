@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
-from typing import Protocol, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
 from appliance.broker.accounts import Account, AccountedSession
 from appliance.broker.backpressure import Congestion, DiskCongestion
@@ -38,10 +38,10 @@ from appliance.mqtt.topics import check_filter, parse_shared
 log = logging.getLogger(__name__)
 
 #: Seconds that a QoS 2 exchange may take before its message counts as delayed.
-DELAYED_AFTER = 0.1
+DELAYED_AFTER: Final = 0.1
 
 #: Receivers that are checked for room for one unit of cost.
-CHECKS_PER_COST_UNIT = 4
+CHECKS_PER_COST_UNIT: Final = 4
 
 #: Limits of one tick: connections, wills and sessions that it ends, and its cost, which is about
 #: ten milliseconds of work.
@@ -52,7 +52,7 @@ COST_PER_TICK = 2600
 #: The cost of refusing a message, of holding a QoS 2 message until its PUBREL and releasing it, and
 #: of creating or resuming a session.
 REFUSAL_COST = 2
-HELD_COST = 3
+HELD_COST: Final = 3
 CONNECT_COST = 50
 
 #: The cost of ending a connection or a session, and of removing one of its subscriptions from the

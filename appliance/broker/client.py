@@ -77,10 +77,10 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 log = logging.getLogger(__name__)
 
 #: The cost of a packet that is not of the data path.
-PACKET_COST = 5
+PACKET_COST: Final = 5
 
 #: How many acknowledgements make room before the window is filled again.
-ROOM_FILLED_AT_ONCE = 32
+ROOM_FILLED_AT_ONCE: Final = 32
 
 #: Bytes of a partial packet, such as a CONNECT before its login, that there is always memory for.
 SMALL_PACKET = 1024

@@ -7,7 +7,7 @@ from typing import Final, Literal, TypeAlias, get_args
 
 #: The cost that one client may cause in one turn of the event loop, see `Counters.cost`: some
 #: milliseconds of work.
-COST_PER_TURN = 1000
+COST_PER_TURN: Final = 1000
 
 #: Why a message was dropped.
 DropReason: TypeAlias = Literal[

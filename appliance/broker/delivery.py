@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from appliance.broker.message import Message
 
 #: Bytes counted for a held QoS 2 message beside itself, and for each receiver without room.
-HELD_SIZE = 200
-FULL_SIZE = 64
+HELD_SIZE: Final = 200
+FULL_SIZE: Final = 64
 
 
 class Group(Protocol):

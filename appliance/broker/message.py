@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Final, Protocol
 
 from appliance.broker.values import PublishRejection
 from appliance.mqtt.codec import (
@@ -20,14 +20,14 @@ from appliance.mqtt.codec import (
 )
 
 #: The approximate memory of a queued message beside its own bytes: the objects around it.
-OVERHEAD = 512
+OVERHEAD: Final = 512
 
 #: The longest interval that a property can encode, in seconds. The remaining time can exceed it
 #: because the clock of a restored message may have gone back.
 LONGEST_INTERVAL = 0xFFFF_FFFF
 
 #: While a message is queued, its encoding is not cached if the payload has at least this size.
-LARGE = 1024
+LARGE: Final = 1024
 
 
 def _passed_on(properties: Properties) -> bytes:

@@ -18,7 +18,7 @@ from appliance.mqtt.reason import ProtocolError, ReasonCode
 
 #: The limit of PUBLISH bytes between two flushes. Further messages stay in the session's queue
 #: until the network has taken these, so that the network determines the client's rate.
-OUTPUT_LIMIT = 1024 * 1024
+OUTPUT_LIMIT: Final = 1024 * 1024
 
 #: The longest topic, in bytes, that gets a topic alias: the topics are stored for each client.
 LONGEST_ALIASED = 512

@@ -7,7 +7,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from appliance.broker.accounting import Accounting
 from appliance.broker.backpressure import Congestion
@@ -42,7 +42,7 @@ READ_COST = 2
 
 #: The size, in bytes, above which a message is large: an image or a map, not a state or a command.
 #: A slow client gets large QoS 0 messages after everything else, see `Link.is_behind`.
-LARGE_MESSAGE = 32 * 1024
+LARGE_MESSAGE: Final = 32 * 1024
 
 #: The approximate memory of a subscription, in bytes: itself, and each level of its filter.
 SUBSCRIPTION_SIZE = 600

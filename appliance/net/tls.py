@@ -29,7 +29,7 @@ RECORD_SIZE: Final = 16 * 1024
 
 #: Bytes that OpenSSL is handed at once. Its buffers never shrink: those of each connection would
 #: keep the size of its largest message.
-PIECE = 2 * RECORD_SIZE
+PIECE: Final = 2 * RECORD_SIZE
 
 #: Records of one connection that are read in a turn: a chunk may hold ten thousand of a byte each.
 #: And the cost of a record, where a chunk has many.
@@ -37,7 +37,7 @@ RECORDS_A_TURN = 256
 RECORD_COST = 1
 
 #: A chunk of at most this many bytes is small, and may be read although others wait for a turn.
-SMALL_CHUNK = 4096
+SMALL_CHUNK: Final = 4096
 
 #: Seconds that a client has to read the last bytes before its connection is aborted.
 CLOSE_TIMEOUT = 10.0
