@@ -26,9 +26,6 @@ LONGEST_ALIASED = 512
 #: The packet classes of refusals with a reason string, by first byte.
 _REFUSALS: dict[int, type[Puback] | type[Pubrec]] = {0x40: Puback, 0x50: Pubrec}
 
-#: How PUBACK, PUBREC, PUBREL and PUBCOMP begin in their shortest form, by first byte.
-_SHORTEST: Final = {first: bytes((first, 2)) for first in (0x40, 0x50, 0x62, 0x70)}
-
 #: Why a message is refused while the store cannot take it.
 CANNOT_KEEP = "it cannot be stored: see the log of the store"
 
@@ -298,7 +295,8 @@ class Output:
 
         `reason` is sent with a refusal to clients that get reason strings.
         """
-        packet = _SHORTEST[first] + packet_id.to_bytes(2, "big")
+        # As one number: first byte, the length 2, packet id. Compiled it takes half of a join.
+        packet = (first << 24 | 2 << 16 | packet_id).to_bytes(4, "big")
         if code:
             if self.version == 5:
                 if code >= 0x80 and self.explains and reason:

@@ -339,12 +339,12 @@ class Session:
 
     def has_room(self, message: Message, refusable: bool = True) -> bool:
         """Whether a QoS 1 or 2 message would be queued; `refusable` as for `deliver`."""
-        limits = self.accounting.limits
+        accounting = self.accounting
         if self.expiry and not self._may_store(message, refusable):
             return False
-        return limits.queue_full == "drop-oldest" or (
-            self.waiting < limits.queue_messages and self.fits(message.size)
-        )
+        return (
+            self.waiting < accounting.queue_messages and self.fits(message.size)
+        ) or accounting.limits.queue_full == "drop-oldest"
 
     def _may_store(self, message: Message, refusable: bool) -> bool:
         accounting = self.accounting

@@ -46,9 +46,6 @@ PUBREC: Final = 5 << 16
 PUBREL: Final = 6 << 16
 PUBCOMP: Final = 7 << 16
 
-# First byte of an acknowledgement -> its event without the packet id.
-_ACKNOWLEDGEMENTS: Final = {0x40: PUBACK, 0x50: PUBREC, 0x62: PUBREL, 0x70: PUBCOMP}
-
 
 #: A buffered chunk below this size, in bytes, is joined with the next one immediately.
 SMALL_CHUNK: Final = 4096
@@ -180,9 +177,11 @@ class PacketFramer:
         # clients that send one packet at a time that would be a fifth of the cost.
         size = len(data)
         if size >= 4 and not self._have and self._reading and self.state is State.CONNECTED:
-            if size == 4 and data[0] in _ACKNOWLEDGEMENTS and data[1] == 2:
+            first = data[0]
+            # The numbers are here and not in a set: compiled they are compared, not looked up.
+            if size == 4 and data[1] == 2 and first in (0x40, 0x50, 0x62, 0x70):
                 if data[2] or data[3]:
-                    return (_ACKNOWLEDGEMENTS[data[0]] | data[2] << 8 | data[3],)
+                    return (first >> 4 << 16 | data[2] << 8 | data[3],)
             elif size == self._head_size and data.startswith(self._head):
                 event = self._repeated(data, 0, size)
                 if event is not None:
@@ -235,12 +234,12 @@ class PacketFramer:
                 body = pos + 2
                 if (
                     length == 2
-                    and first in _ACKNOWLEDGEMENTS
+                    and first in (0x40, 0x50, 0x62, 0x70)
                     and end - pos >= 4
                     and (buf[body] or buf[body + 1])
                     and self.state is State.CONNECTED
                 ):
-                    yield _ACKNOWLEDGEMENTS[first] | buf[body] << 8 | buf[body + 1]
+                    yield first >> 4 << 16 | buf[body] << 8 | buf[body + 1]
                     pos += 4
                     continue
                 if length > 0x7F:
