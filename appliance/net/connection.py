@@ -440,8 +440,9 @@ class ClientConnection:
         portion = 0 if scheduler.is_busy() else scheduler.portion
         if len(data) >= LARGE_CHUNK or len(data) > portion:
             self._resume_input_later()
-        if len(data) > portion:
-            self._keep_backlog(data, portion)
+        if len(data) <= portion:
+            return data  # compiled, a slice of all of it would be a copy
+        self._keep_backlog(data, portion)
         return data[:portion]
 
     def _check_publisher(self) -> None:
