@@ -25,6 +25,10 @@ class CongestedReader(Protocol):
     def inflight(self) -> Sized:
         """What it was sent and has not acknowledged."""
 
+    @property
+    def awaits_store(self) -> bool:
+        """Whether it can be sent nothing until the store has read on."""
+
 
 @dataclass(slots=True)
 class Accounting:

@@ -207,7 +207,9 @@ class Congestion:
 
     def _update_unacknowledged(self) -> None:
         inflight = self._reader.inflight
-        has_unacknowledged = len(self._held_back) < len(inflight) or not inflight
+        has_unacknowledged = len(self._held_back) < len(inflight) or not (
+            inflight or self._reader.awaits_store
+        )
         if has_unacknowledged is not self._has_unacknowledged:
             self._settle()
             self._has_unacknowledged = has_unacknowledged
@@ -263,6 +265,7 @@ class Congestion:
         self._unwritten.clear()
         self._held_back.clear()
         self._has_unacknowledged = True
+        self._update_unacknowledged()
         if not self._allowance.used_up:
             self._accounting.congested[self._reader] = None
 

@@ -34,8 +34,9 @@ REPLAYS_PER_COST_UNIT = 8
 #: Messages of a session that are looked at for one unit of cost: whether others may have them.
 PASSED_PER_COST_UNIT = 16
 
-#: Messages of a restored queue that are read when the oldest one is to be dropped.
+#: Messages of a restored queue that are read at once when the oldest ones are to be dropped.
 FEW_READ = 16
+MANY_READ = 100
 
 #: The cost of reading one of them.
 READ_COST = 2
@@ -257,6 +258,11 @@ class Session:
         return len(self.queue) + self.gap.unread.count + len(self.gap.newer)
 
     @property
+    def awaits_store(self) -> bool:
+        """Whether it can be sent nothing until the store has read on."""
+        return self.gap is not None and not self.queue
+
+    @property
     def ready(self) -> bool:
         """Whether a message would be sent immediately."""
         link = self.link
@@ -372,7 +378,8 @@ class Session:
         self.accounting.queued_bytes += size
         (self.queue if self.gap is None else self.gap.newer).append(delivery)
         self.queue_bytes += size
-        if self.congestion is None and 2 * len(self.queue) > self.accounting.queue_messages:
+        waiting = len(self.queue) if self.gap is None else self.waiting
+        if self.congestion is None and 2 * waiting > self.accounting.queue_messages:
             self._congest()
         return True
 
@@ -391,7 +398,8 @@ class Session:
             self.waiting < accounting.queue_messages and self.fits(message.size)
         ):
             if not self.queue:
-                self._read(FEW_READ)
+                too_many = self.waiting - accounting.queue_messages
+                self._read(max(FEW_READ, min(too_many, MANY_READ)))
                 continue
             self._report_full(message.size)
             oldest = self.queue.popleft()
@@ -1043,7 +1051,10 @@ class Session:
         passed on, too: the other member may get a duplicate. QoS 2 messages stay [MQTT-4.8.2-4],
         [MQTT-4.8.2-5].
         """
-        if self.gap is not None and self.gap.unread.is_shared:
+        gap = self.gap
+        if gap is not None and (
+            gap.unread.is_shared or any(delivery[4] is not None for delivery in gap.newer)
+        ):
             self.read_all()
 
         def is_given(delivery: Delivery) -> bool:

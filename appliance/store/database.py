@@ -74,7 +74,6 @@ class Database:
         self._lock: int | None = None
         self._contents: Contents | None = None
         self._opening: threading.Thread | None = None
-        self._error: BaseException | None = None
 
     def open(self) -> None:
         """Lock the database and read all of it.
@@ -83,14 +82,19 @@ class Database:
             StoreError: another appliance uses it, a newer one made it, or it cannot be read.
         """
         opening, self._opening = self._opening, None
-        if opening is None:
-            self._open()
+        if opening is not None:
+            opening.join()
+        if self._contents is not None:
             return
-        opening.join()
-        if self._error is not None:
-            raise self._error
+        self._prepare()
+        try:
+            self._contents = read(self.path, self._durability)
+        except BaseException:
+            self.close()
+            raise
 
-    def _open(self) -> None:
+    def _prepare(self) -> None:
+        """Make the folder, and lock the database. Raises StoreError."""
         try:
             # The folder is for the appliance's user only when it is created here.
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -105,23 +109,21 @@ class Database:
                     f"{error.filename or self.path}: {error.strerror} (broker.store.path)"
                 ) from None
             log.warning("%s: %s", error.filename, error.strerror)
-        try:
-            self._contents = read(self.path, self._durability)
-        except BaseException:
-            self.close()
-            raise
 
     def begin_opening(self) -> None:
-        """Begin to read it in a thread: `open` waits for that, and raises what it has raised.
+        """Begin to read it in a thread; `open` waits for that.
 
         Most of a second for 400,000 messages is SQLite's, which another core can do beside a start.
+        Whatever goes wrong there is met again, and said, by `open`: until then nothing is changed.
         """
 
         def read_it() -> None:
             try:
-                self._open()
-            except BaseException as error:
-                self._error = error
+                if self.path.exists():
+                    self._take_lock()
+                    self._contents = _read(self.path, self._durability)
+            except Exception:
+                self.close()
 
         self._opening = threading.Thread(target=read_it, name="store-open", daemon=True)
         self._opening.start()

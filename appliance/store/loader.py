@@ -103,6 +103,8 @@ class Loaded:
     retained: dict[int, OwnedMessage] = field(default_factory=dict)
     backlogs: LoadedBacklogs = field(default_factory=LoadedBacklogs)
     useless: list[tuple[Table, int]] = field(default_factory=list)
+    #: Queues of sessions that are not there.
+    orphans: list[UnreadRows] = field(default_factory=list)
     last_key: int = 0
 
 
@@ -158,7 +160,7 @@ def load(rows: Rows, offset: float) -> Loaded:
             loaded.sessions[key].unread = unread
         else:
             wrong += len(unread)
-            loaded.useless += [(Table.OWED, owed) for owed in unread.keys]
+            loaded.orphans.append(unread)
     damaged = [key for key, row in rows.segment.items() if row.length == 0]
     for key in damaged:
         del rows.segment[key]

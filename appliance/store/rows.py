@@ -196,20 +196,21 @@ MESSAGE_OVERHEAD = 120
 #: The condition on rows of `owed` that may be read later: queued, and not obviously damaged.
 MAY_WAIT = (
     "packet_id IS NULL AND id BETWEEN 1 AND 4503599627370496 "
-    "AND typeof(session) = 'integer' AND typeof(message) = 'integer'"
+    "AND typeof(session) = 'integer' AND typeof(message) = 'integer' "
+    "AND message BETWEEN 1 AND 4503599627370496"
 )
 
 #: Bytes of a message in the database.
-_SIZE = (
+SIZE = (
     f"length(CAST(topic AS BLOB)) + 2 + length(payload) + {MESSAGE_OVERHEAD} "
     f"+ coalesce(length(properties), {len(NO_PROPERTIES)})"
 )
 
 #: The keys of all messages, and their bytes.
-SIZES = f"SELECT id, coalesce({_SIZE}, 0) FROM message"
+SIZES = f"SELECT id, coalesce({SIZE}, 0) FROM message"
 
 #: How many messages there are, and their bytes.
-STORED = f"SELECT count(*), total({_SIZE}) FROM message"
+STORED = f"SELECT count(*), total({SIZE}) FROM message"
 
 #: What has to be known of each queue before its rows are read: the keys, the bytes in the store,
 #: and about what `Message.size` has for each, too (a topic that is not ASCII takes two bytes a
@@ -219,7 +220,7 @@ QUEUES = f"""
         total(size + text)
     FROM (
         SELECT waiting.id, session, waiting.message, share IS NOT NULL AS is_shared,
-            {_SIZE} AS size,
+            {SIZE} AS size,
             {OVERHEAD - MESSAGE_OVERHEAD} + length(CAST(topic AS BLOB)) + 4 + length(topic)
             + CASE length(topic) WHEN length(CAST(topic AS BLOB)) THEN 0 ELSE 76 + length(topic) END
             AS text
@@ -232,7 +233,7 @@ QUEUES = f"""
 
 #: The messages of some rows, each with its bytes; what is selected follows.
 MESSAGES_OF = f"""
-    SELECT owed.id, message.id, {_SIZE}
+    SELECT owed.id, message.id, {SIZE}
     FROM owed JOIN message ON message.id = owed.message WHERE owed.id
 """
 

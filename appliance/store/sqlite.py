@@ -125,7 +125,7 @@ class SqliteStore(StagingStore):
                 f"; {later} of the messages are read while clients are served" if later else "",
             )
         if self._unread is not None:
-            self._unread.start(entries, broker.router.shares.get)
+            self._unread.start(entries, broker.router.shares.get, broker.flush)
 
     def _prepare_batch(self, contents: Contents, next_key: int) -> None:
         """Begin the first batch, with what is not in the database yet."""
@@ -150,6 +150,8 @@ class SqliteStore(StagingStore):
         for session in loaded.sessions.values():
             if session.unread is not None:
                 session.saved.unread = unread.add(session.unread)
+        for orphan in loaded.orphans:
+            unread.drop_rows(list(orphan.keys))
         return unread
 
     def _restore_retained(self, broker: Broker, loaded: Loaded) -> None:

@@ -21,12 +21,13 @@ from appliance.broker.session import Session
 from appliance.broker.shared import Share
 from appliance.net.callbacks import Entries
 from appliance.store.committer import Committer
-from appliance.store.loader import WRONG, Loaded, message_of, pending_of
+from appliance.store.loader import Loaded, message_of, pending_of
 from appliance.store.messages import StoredMessages
 from appliance.store.rows import (
     COLUMNS,
     MESSAGES_OF,
     ROW_TYPES,
+    SIZES,
     MessageRow,
     OwedRow,
     Table,
@@ -43,6 +44,14 @@ log = logging.getLogger("appliance.store")
 MESSAGES_A_TURN = 100
 BYTES_A_TURN = 256 * 1024
 
+#: The least part of a turn that a queue takes, and the most messages that are read before it is
+#: known how large they are.
+A_QUEUE = 0.05
+AT_ONCE = 25
+
+#: Seconds until a turn that has failed is repeated.
+AGAIN = 0.1
+
 #: Rows that one statement selects.
 _SELECTED = 100
 
@@ -54,12 +63,22 @@ def _marks(keys: Sequence[int]) -> str:
     return ",".join("?" * len(keys))
 
 
+def _text(data: bytes) -> str | bytes:
+    """Text that is damaged makes its own row wrong, and not the others."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data
+
+
 class UnreadQueue:
     """The rows of a session's queue that were not read yet: the port `Unread`."""
 
     def __init__(self, queues: UnreadQueues, rows: UnreadRows) -> None:
         self._queues = queues
         self.rows = rows
+        #: The keys of rows that could not be read.
+        self.left: list[int] = []
         #: Set when the broker has restored the session.
         self.session: Session
         self.stored: StoredSession
@@ -115,18 +134,21 @@ class UnreadQueues:
         self._messages = messages
         self._committer = committer
         self._connection: sqlite3.Connection | None = None
-        #: Those that were not read to their end, by themselves, in the order of reading.
+        #: Those that were not read to their end; among them those that somebody waits for, the
+        #: longest wait first.
         self._queues: dict[UnreadQueue, None] = {}
+        self._awaited: dict[UnreadQueue, None] = {}
         self._references = unread.references
         #: Messages that rows refer to which were not read yet, by their keys.
         self._known: dict[int, Message] = {}
         self._topics: dict[str, bytes] = {}
         self._share_of: Callable[[str], Share | None]
+        self._flush: Callable[[], None]
         self._entries: Entries
         self._timer: asyncio.TimerHandle | None = None
         self._total = self._left_there = self._wrong = 0
         self._began = self._report_at = 0.0
-        self._is_running = False
+        self._is_running = self._is_stopped = False
         state.bytes = unread.stored
         for key, message in loaded.messages.items():
             if key in self._references:
@@ -148,9 +170,18 @@ class UnreadQueues:
         stored.drop_unread = queue.drop
         stored.account.stored += queue.rows.size
 
-    def start(self, entries: Entries, share_of: Callable[[str], Share | None]) -> None:
-        """Begin to read in turns; `share_of` returns the group of a shared subscription."""
-        self._entries, self._share_of = entries, share_of
+    def start(
+        self,
+        entries: Entries,
+        share_of: Callable[[str], Share | None],
+        flush: Callable[[], None],
+    ) -> None:
+        """Begin to read in turns.
+
+        `share_of` returns the group of a shared subscription, `flush` is the broker's, for what a
+        turn sends.
+        """
+        self._entries, self._share_of, self._flush = entries, share_of, flush
         self._total = len(self)
         self._began = entries.time()
         self._report_at = self._began + REPORT
@@ -159,6 +190,10 @@ class UnreadQueues:
 
     def stop(self) -> None:
         """Read no more; what is left is there for the next start."""
+        self._is_stopped = True
+        self._end_turns()
+
+    def _end_turns(self) -> None:
         self._is_running = False
         if self._timer is not None:
             self._timer.cancel()
@@ -170,9 +205,9 @@ class UnreadQueues:
             connection.close()
 
     def hurry(self, queue: UnreadQueue) -> None:
-        """Read this one next."""
-        if queue in self._queues and next(iter(self._queues)) is not queue:
-            self._queues = {queue: None} | self._queues
+        """Read this one before those that nobody waits for."""
+        if queue in self._queues:
+            self._awaited.setdefault(queue)
 
     # --- turns ---------------------------------------------------------------------------------
 
@@ -181,24 +216,19 @@ class UnreadQueues:
             self._timer.cancel()
         if self._is_running:
             self._timer = self._entries.later(
-                "store.unread", delay, self._turn, failed=self._next_turn
+                "store.unread", delay, self._turn, failed=partial(self._next_turn, AGAIN)
             )
 
     def _turn(self) -> None:
         if not self._is_running:
             return
         began = self._entries.time()
-        budget = 1.0
-        while self._queues and budget > 0:
-            queue = next(iter(self._queues))
-            before = queue.count
-            # The next ones may be larger than the average; a queue's limit of bytes bounds that.
-            average = queue.rows.size / before
-            cost = max(1 / MESSAGES_A_TURN, average / BYTES_A_TURN)
-            queue.session.read_on(max(1, int(budget / cost)))
-            if queue.count == before:
-                self._end(queue)
-            budget -= cost * (before - queue.count)
+        try:
+            budget = 1.0
+            while self._queues and budget > 0:
+                budget -= self._read_some(next(iter(self._awaited or self._queues)), budget)
+        finally:
+            self._flush()
         now = self._entries.time()
         if self._queues:
             if now >= self._report_at:
@@ -209,8 +239,23 @@ class UnreadQueues:
         else:
             self._finish()
 
+    def _read_some(self, queue: UnreadQueue, budget: float) -> float:
+        """Read on in a queue; returns the part of a turn that it took."""
+        rows, before = queue.rows, queue.count
+        if not before:  # a fault has kept it here
+            queue.session.read_on(1)
+            self._end(queue)
+            return A_QUEUE
+        size = rows.size
+        cost = max(1 / MESSAGES_A_TURN, size / before / BYTES_A_TURN)  # of one, on average
+        queue.session.read_on(max(1, min(int(budget / cost), AT_ONCE)))
+        if queue.count == before:
+            self._end(queue)
+        read, taken = before - queue.count, size - rows.size
+        return max(A_QUEUE, read / MESSAGES_A_TURN, taken / BYTES_A_TURN)
+
     def _finish(self) -> None:
-        self.stop()
+        self._end_turns()
         self._messages.lose_order()
         if self._wrong:
             log.warning("%d rows of the store mean nothing, and were left out", self._wrong)
@@ -236,6 +281,7 @@ class UnreadQueues:
                 referred = {cast(int, row.message) for row in owed.values()}
                 missing = sorted(referred - self._known.keys())
                 stored = cast("dict[int, MessageRow]", self._select(Table.MESSAGE, missing))
+                sizes = dict(self._execute(f"{SIZES} WHERE id IN ({_marks(missing)})", missing))
             except (sqlite3.Error, UnicodeError) as error:
                 self._give_up(queue, error)
                 break
@@ -243,15 +289,16 @@ class UnreadQueues:
             for key in keys:
                 try:
                     row = owed[key]
-                    message = self._message(cast(int, row.message), stored)
+                    message = self._message(cast(int, row.message), stored, sizes)
                     found.append(self._delivery(queue, row, message))
-                except WRONG as error:
+                except Exception as error:  # whatever a damaged row leads to
                     log.debug("a queued message cannot be restored: %s", error)
                     self._wrong += 1
                     self._committer.open.remove(Table.OWED, key)
                     self._committer.stage_lazily()
                 if key in owed:
-                    self._unrefer(cast(int, owed[key].message))
+                    message_key = cast(int, owed[key].message)
+                    self._unrefer(message_key, sizes.get(message_key, 0))
         if not len(rows):
             self._end(queue)
         return found
@@ -262,6 +309,7 @@ class UnreadQueues:
         queue.stored.account.stored -= queue.rows.size
         queue.rows.size = 0
         self._queues.pop(queue, None)
+        self._awaited.pop(queue, None)
 
     def _select(self, table: Table, keys: Sequence[int]) -> dict[int, object]:
         """The rows with these keys. Raises sqlite3.Error, UnicodeError."""
@@ -277,22 +325,28 @@ class UnreadQueues:
     def _execute(self, statement: str, keys: Sequence[int]) -> list[tuple[Any, ...]]:
         """Raises sqlite3.Error, UnicodeError."""
         try:
-            if self._connection is None:
-                self._connection = connect_beside(self._path)
-            return self._connection.execute(statement, keys).fetchall()
+            return self._connected().execute(statement, keys).fetchall()
         except sqlite3.Error:  # the open file may be the reason
             self._close()
-            self._connection = connect_beside(self._path)
-            return self._connection.execute(statement, keys).fetchall()
+            return self._connected().execute(statement, keys).fetchall()
 
-    def _message(self, key: int, stored: dict[int, MessageRow]) -> Message:
+    def _connected(self) -> sqlite3.Connection:
+        """Raises sqlite3.Error."""
+        if self._is_stopped:
+            raise sqlite3.OperationalError("the appliance is stopping")
+        if self._connection is None:
+            self._connection = connect_beside(self._path)
+            self._connection.text_factory = _text
+        return self._connection
+
+    def _message(self, key: int, stored: dict[int, MessageRow], sizes: dict[int, int]) -> Message:
         """A message that rows refer to which were not read yet. Raises one of `WRONG`."""
         message = self._known.get(key)
         if message is None:
             row = stored[key]
             message, _ = message_of(row, self._offset, self._topics)
             self._messages.load(key, message, cast(float, row.stored_at))
-            self._state.bytes -= self._messages.size(message)  # it was counted at the start
+            self._state.bytes -= sizes[key]  # which was counted at the start
             self._messages.hold(message)
             self._known[key] = message
         return message
@@ -311,8 +365,8 @@ class UnreadQueues:
         queue.rows.size -= size
         return delivery
 
-    def _unrefer(self, key: int, size: int = 0) -> None:
-        """One row less is left that refers to the message, of `size` bytes if it was not read."""
+    def _unrefer(self, key: int, size: int) -> None:
+        """One row less is left that refers to the message, of `size` bytes if it was not loaded."""
         left = self._references.pop(key, 1) - 1
         if left:
             self._references[key] = left
@@ -329,20 +383,25 @@ class UnreadQueues:
         if not self._left_there:
             log.error("queues in %s CANNOT BE READ: %s", self._path, error)
         self._left_there += len(queue.rows)
+        queue.left = list(queue.rows.keys[queue.rows.next :])
         self._end(queue)
 
     def drop(self, queue: UnreadQueue) -> None:
         """Delete the rows that were not read, because the session has ended."""
-        keys = queue.rows.keys[queue.rows.next :]
-        for start in range(0, len(keys), _SELECTED):
-            part = keys[start : start + _SELECTED]
-            for key in part:
-                self._committer.open.remove(Table.OWED, key)
-            try:
-                messages = self._execute(f"{MESSAGES_OF} IN ({_marks(part)})", part)
-            except (sqlite3.Error, UnicodeError) as error:
-                log.error("messages of a session that has ended stay in %s: %s", self._path, error)
-                break
-            for _, message, size in messages:
-                self._unrefer(message, size)
+        self.drop_rows(queue.left or list(queue.rows.keys[queue.rows.next :]))
+        queue.left = []
         self._end(queue)
+
+    def drop_rows(self, keys: list[int]) -> None:
+        """Delete rows, and the messages that nothing else refers to."""
+        for key in keys:
+            self._committer.open.remove(Table.OWED, key)
+        try:
+            for start in range(0, len(keys), _SELECTED):
+                part = keys[start : start + _SELECTED]
+                for _, message, size in self._execute(f"{MESSAGES_OF} IN ({_marks(part)})", part):
+                    self._unrefer(message, size)
+        except sqlite3.Error as error:
+            log.error("messages that nobody gets any more stay in %s: %s", self._path, error)
+        if not self._is_running and not self._queues:
+            self._close()

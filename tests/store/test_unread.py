@@ -19,7 +19,7 @@ from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.session import FEW_READ, Session
 from appliance.mqtt.packets import Publish, Subscribe, Subscription, Unsubscribe
-from appliance.store import database, unread
+from appliance.store import SqliteStore, StoreError, database, unread
 from store.harness import Harness, difference, state
 
 NAMES = ("one", "two", "three")
@@ -452,3 +452,207 @@ async def test_a_fault_of_a_turn_is_contained(
     escaped.clear()
     assert [payloads(harness.broker.sessions[name]) for name in NAMES] == [IN_ORDER] * 3
     check_accounts(harness.broker)
+
+
+async def grouped(start: Callable[..., Harness]) -> Harness:
+    """A broker whose queues are unread, with a group of which `one` is a member, and an heir."""
+    harness = start()
+    await all_read(harness)
+    for name in ("one", "heir"):
+        client = await harness.join(name, **lasting(5))
+        client.send(Subscribe(9, [Subscription("$share/group/jobs", 1)]))
+        client.lose()
+    await harness.written()
+    return start()
+
+
+async def test_newer_messages_of_a_group_are_passed_on_too(start: Callable[..., Harness]) -> None:
+    harness = await grouped(start)
+    inside = harness.broker.attach("_inside", InsideLink())
+    for number in range(20):
+        harness.broker.publish(Message("jobs", b"job %d" % number, 1), inside)
+    one, heir = harness.broker.sessions["one"], harness.broker.sessions["heir"]
+    assert one.gap is not None and one.gap.newer and not one.gap.unread.is_shared
+    harness.broker.delete(one, "")
+    assert len(heir.queue) == 20
+
+
+async def test_what_a_turn_sends_leaves_with_it(start: Callable[..., Harness]) -> None:
+    harness = start()
+    client = harness.peer()
+    client.say_connect("one", **lasting(5))
+    client.client.accept(client.user)
+    harness.broker.flush()
+    queues = harness.store._unread
+    assert queues is not None
+    queues._turn()
+    assert not harness.broker.unflushed
+    assert len(harness.broker.sessions["one"].inflight) == Limits().inflight
+
+
+async def test_a_damaged_key_does_not_have_keys_given_out_twice(
+    start: Callable[..., Harness], tmp_path: Path
+) -> None:
+    with sqlite3.connect(tmp_path / "first/state/store.db") as connection:
+        keys = [key for (key,) in connection.execute("SELECT id FROM owed ORDER BY id")]
+        connection.execute("UPDATE owed SET message = ? WHERE id = ?", (1 << 60, keys[0]))
+        connection.execute("UPDATE owed SET message = -5 WHERE id = ?", (keys[1],))
+    connection.close()
+    harness = start()
+    assert next(harness.store._committer.keys) > keys[-1]
+    await all_read(harness)
+    assert sum(len(session.queue) for session in harness.broker.sessions.values()) == (
+        3 * (COUNT + 1) - 2
+    )
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("message", "topic", "CAST(x'ff41' AS TEXT)"),
+        ("owed", "share", "CAST(x'ff41' AS TEXT)"),
+        ("owed", "subscription_ids", f"'{'[' * 100_000}'"),
+    ],
+)
+async def test_a_row_that_no_decoder_takes_is_left_out_alone(
+    start: Callable[..., Harness], tmp_path: Path, table: str, column: str, value: str
+) -> None:
+    with sqlite3.connect(tmp_path / "first/state/store.db") as connection:
+        (last,) = connection.execute(
+            "SELECT max(id) FROM message WHERE topic LIKE 'one/%'"
+        ).fetchone()
+        key = "id" if table == "message" else "message"
+        connection.execute(f"UPDATE {table} SET {column} = {value} WHERE {key} = ?", (last,))
+    connection.close()
+    harness = start()
+    await all_read(harness)
+    assert not harness.broker.faults.count
+    one = harness.broker.sessions["one"]
+    assert one.gap is None
+    assert payloads(one) == [*IN_ORDER[:-2], b"of them"]
+    for session in list(harness.broker.sessions.values()):
+        harness.broker.delete(session, "")
+    harness.broker.publish(
+        Message("all", b"", retain=True), harness.broker.attach("_", InsideLink())
+    )
+    await harness.written()
+    assert rows(harness, "message") == rows(harness, "owed") == harness.store.bytes == 0
+
+
+async def test_rows_of_a_session_that_is_not_there_take_their_messages_along(
+    start: Callable[..., Harness], tmp_path: Path
+) -> None:
+    with sqlite3.connect(tmp_path / "first/state/store.db") as connection:
+        connection.execute("DELETE FROM session WHERE client_id = 'one'")
+    connection.close()
+    harness = start()
+    await all_read(harness)
+    await harness.written()
+    assert rows(harness, "message WHERE topic LIKE 'one/%'") == 0
+    assert rows(harness, "owed") == 2 * (COUNT + 1)
+    assert harness.store.bytes == sum(
+        stored.size for stored in harness.store._messages._messages.values()
+    )
+
+
+@pytest.mark.patches
+async def test_what_could_not_be_read_ends_with_its_session(
+    start: Callable[..., Harness], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    harness = start()
+
+    def fail(*_: object) -> object:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    with monkeypatch.context() as context:
+        context.setattr(unread.UnreadQueues, "_execute", fail)
+        await all_read(harness)
+    harness.broker.delete(harness.broker.sessions["one"], "")
+    await harness.written()
+    assert rows(harness, "owed") == 2 * (COUNT + 1)
+    assert rows(harness, "message WHERE topic LIKE 'one/%'") == 0
+
+
+async def test_publishers_wait_for_a_queue_that_is_being_read(
+    start: Callable[..., Harness], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As they do for one that is in memory; and the reader is not blamed for it."""
+    monkeypatch.setattr(unread, "MESSAGES_A_TURN", 1)
+    harness = start(Limits(queue_messages=COUNT + 50, user=ALONE))
+    session = harness.broker.sessions["one"]
+    client = harness.peer()
+    client.say_connect("one", **lasting(5))
+    client.client.accept(client.user)
+    assert session.congestion is not None
+    session.queue.clear()
+    session.inflight.clear()
+    assert session.awaits_store
+    session.congestion.resume()
+    assert not session.congestion._has_unacknowledged
+
+
+async def test_a_queue_with_a_gap_is_as_crowded_as_one_in_memory(
+    start: Callable[..., Harness], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unread, "MESSAGES_A_TURN", 1)
+    harness = start(Limits(queue_messages=2 * COUNT + 10, user=ALONE))
+    session = harness.broker.sessions["one"]
+    client = harness.peer()
+    client.say_connect("one", **lasting(5))
+    client.client.accept(client.user)
+    assert session.congestion is None
+    inside = harness.broker.attach("_inside", InsideLink())
+    for _ in range(10):
+        harness.broker.publish(Message("one/x", b"new", 1), inside)
+    assert session.gap is not None and session.congestion is not None
+
+
+async def test_the_client_that_waits_longest_is_read_first(start: Callable[..., Harness]) -> None:
+    harness = start()
+    queues = harness.store._unread
+    assert queues is not None
+    for name in ("three", "two", "one", "three"):
+        gap = harness.broker.sessions[name].gap
+        assert gap is not None
+        gap.unread.hurry()
+    assert [queue.session.client_id for queue in queues._awaited] == [
+        "three",
+        "two",
+        "one",
+    ]
+    await all_read(harness)
+    assert not queues._awaited
+
+
+async def test_a_start_that_fails_after_the_early_reading_changes_nothing(tmp_path: Path) -> None:
+    harness = Harness(tmp_path / "first").start()
+    await harness.join("one", **lasting(5))
+    await harness.stop()
+    data = bytearray(harness.path.read_bytes())
+    data[4096:8192] = bytes(4096)
+    harness.path.write_bytes(data)
+    store = SqliteStore(harness.path)
+    store.begin_opening()
+    opening = store._database._opening
+    assert opening is not None
+    opening.join()
+    assert harness.path.read_bytes() == data  # it was not set aside
+    store.open()
+    assert list(harness.path.parent.glob("store.db.damaged-*"))
+    await store.close()
+
+
+async def test_it_is_opened_early_and_only_once(tmp_path: Path) -> None:
+    harness = Harness(tmp_path / "first").start()
+    await harness.join("one", **lasting(5))
+    await harness.stop()
+    store = SqliteStore(harness.path)
+    store.begin_opening()
+    other = SqliteStore(harness.path)
+    store.open()
+    other.begin_opening()
+    with pytest.raises(StoreError, match="in use"):
+        other.open()
+    await store.close()
+    other.open()
+    await other.close()
