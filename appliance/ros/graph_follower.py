@@ -1,10 +1,10 @@
 """Follows the ROS graph for the bridge, on the ROS thread.
 
-The follower polls the graph 5 to 10 times a second. It opens and closes what carries messages as
-routes are replaced and as topics come and go, and it notices when the bus is lost. It shares two
-immutable snapshots with the event loop's thread, each replaced as a whole: the loop writes
-`TopicRoutes`, the follower writes `FollowedTopics`. Everything else that the loop has to know is
-posted to it as a call of `GraphEvents`.
+The follower polls the graph 6 times a second, twice a second with a thousand topics. It opens and
+closes what carries messages as routes are replaced and as topics come and go, and it notices when
+the bus is lost. It shares two immutable snapshots with the event loop's thread, each replaced as a
+whole: the loop writes `TopicRoutes`, the follower writes `FollowedTopics`. Everything else that the
+loop has to know is posted to it as a call of `GraphEvents`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from appliance.ros.topics.route import BridgeRoute, Direction
 from appliance.ros.topics.to_mqtt import ToMqtt
 from appliance.ros.topics.to_ros import ToRos
 
-#: Every flow asks for its endpoints at each 5th poll (within a second) although their number has
-#: not changed: one may have been replaced by another. At each poll it is another fifth of them.
+#: Every flow asks for its endpoints at each 5th poll (within a second, or three with a thousand
+#: topics) although their number has not changed: one may have been replaced by another. At each
+#: poll it is another fifth of them.
 THOROUGH_POLL = 5
 
 #: The nodes on the bus are counted at each 10th poll.

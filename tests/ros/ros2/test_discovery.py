@@ -14,6 +14,7 @@ from waiting import until
 from appliance.host.environment import for_other_programs
 from appliance.ros.ros2 import discovery, fastdds
 from appliance.ros.ros2.network_scope import NetworkScope, find_scope
+from appliance.ros.ros2.node import LONGEST_INTERVAL, POLL_INTERVAL, interval_after
 
 RANGE = discovery.RANGE
 
@@ -191,3 +192,10 @@ async def test_with_security_enforced_and_no_keys_nothing_is_joined(monkeypatch,
         node.stop()
     assert looks == []
     assert str(tmp_path / "enclaves/appliance") in failures[0] and "\n" not in failures[0]
+
+
+def test_polls_are_rarer_where_they_take_long():
+    assert interval_after(0.001) == interval_after(0.0) == POLL_INTERVAL
+    assert interval_after(0.05) == pytest.approx(0.3)
+    assert interval_after(0.08) + 0.08 < 1.0  # noticed within a second, with a thousand topics
+    assert interval_after(10.0) == LONGEST_INTERVAL
