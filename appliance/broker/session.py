@@ -317,7 +317,7 @@ class Session:
                 accounting.queued_bytes += size
                 self._send(link, cast(Delivery, (message, qos, retain, subscription_ids, share)))
                 return True
-            if (len(self.queue) if self.gap is None else self.waiting) < accounting.queue_messages:
+            if self.waiting < accounting.queue_messages:
                 return self._enqueue(
                     cast(Delivery, (message, qos, retain, subscription_ids, share)), refusable
                 )
@@ -378,8 +378,7 @@ class Session:
         self.accounting.queued_bytes += size
         (self.queue if self.gap is None else self.gap.newer).append(delivery)
         self.queue_bytes += size
-        waiting = len(self.queue) if self.gap is None else self.waiting
-        if self.congestion is None and 2 * waiting > self.accounting.queue_messages:
+        if self.congestion is None and 2 * self.waiting > self.accounting.queue_messages:
             self._congest()
         return True
 

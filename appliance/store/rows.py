@@ -276,7 +276,7 @@ class UnreadRows:
 
 
 @dataclass(slots=True)
-class Unread:
+class UnreadContents:
     """The queues of sessions whose rows are read later, and the messages that they refer to."""
 
     #: By the keys of the sessions.
@@ -320,7 +320,7 @@ class Rows:
     segment: dict[int, SegmentRow] = field(default_factory=dict)
     latest: dict[int, LatestRow] = field(default_factory=dict)
     #: What is read later is in none of these.
-    unread: Unread = field(default_factory=lambda: Unread())
+    unread: UnreadContents = field(default_factory=UnreadContents)
 
     def of(self, table: Table) -> dict[int, Row]:
         """The rows of one table."""

@@ -27,11 +27,11 @@ from appliance.store.rows import (
     COLUMNS,
     MESSAGES_OF,
     ROW_TYPES,
-    SIZES,
+    SIZE,
     MessageRow,
     OwedRow,
     Table,
-    Unread,
+    UnreadContents,
     UnreadRows,
 )
 from appliance.store.schema import connect_beside
@@ -122,7 +122,7 @@ class UnreadQueues:
         self,
         path: Path,
         loaded: Loaded,
-        unread: Unread,
+        unread: UnreadContents,
         offset: float,
         state: StoreState,
         messages: StoredMessages,
@@ -256,6 +256,7 @@ class UnreadQueues:
 
     def _finish(self) -> None:
         self._end_turns()
+        self._topics.clear()
         self._messages.lose_order()
         if self._wrong:
             log.warning("%d rows of the store mean nothing, and were left out", self._wrong)
@@ -276,12 +277,12 @@ class UnreadQueues:
         end = min(rows.next + max(count, 1), len(rows.keys))
         while rows.next < end:
             keys = rows.keys[rows.next : min(rows.next + _SELECTED, end)]
+            sizes: dict[int, int] = {}
             try:
                 owed = cast("dict[int, OwedRow]", self._select(Table.OWED, keys))
                 referred = {cast(int, row.message) for row in owed.values()}
                 missing = sorted(referred - self._known.keys())
-                stored = cast("dict[int, MessageRow]", self._select(Table.MESSAGE, missing))
-                sizes = dict(self._execute(f"{SIZES} WHERE id IN ({_marks(missing)})", missing))
+                stored = cast("dict[int, MessageRow]", self._select(Table.MESSAGE, missing, sizes))
             except (sqlite3.Error, UnicodeError) as error:
                 self._give_up(queue, error)
                 break
@@ -305,22 +306,32 @@ class UnreadQueues:
 
     def _end(self, queue: UnreadQueue) -> None:
         """All rows were read, or need not be."""
-        queue.rows.next = len(queue.rows.keys)
-        queue.stored.account.stored -= queue.rows.size
-        queue.rows.size = 0
+        rows = queue.rows
+        rows.keys, rows.next = rows.keys[:0], 0  # the session refers to it for as long as it lives
+        queue.stored.account.stored -= rows.size
+        rows.size = 0
         self._queues.pop(queue, None)
         self._awaited.pop(queue, None)
 
-    def _select(self, table: Table, keys: Sequence[int]) -> dict[int, object]:
-        """The rows with these keys. Raises sqlite3.Error, UnicodeError."""
+    def _select(
+        self, table: Table, keys: Sequence[int], sizes: dict[int, int] | None = None
+    ) -> dict[int, object]:
+        """The rows with these keys; of messages also their `sizes`, which are added.
+
+        Raises:
+            sqlite3.Error, UnicodeError: they cannot be read.
+        """
         if not keys:
             return {}
         make = partial(tuple.__new__, ROW_TYPES[table])
         columns = ",".join(COLUMNS[table])
+        size = SIZE if sizes is not None else "0"
         found = self._execute(
-            f"SELECT {columns} FROM {table.name.lower()} WHERE id IN ({_marks(keys)})", keys
+            f"SELECT {columns}, {size} FROM {table.name.lower()} WHERE id IN ({_marks(keys)})", keys
         )
-        return {row[0]: make(row) for row in found}
+        if sizes is not None:
+            sizes.update((row[0], row[-1] or 0) for row in found)
+        return {row[0]: make(row[:-1]) for row in found}
 
     def _execute(self, statement: str, keys: Sequence[int]) -> list[tuple[Any, ...]]:
         """Raises sqlite3.Error, UnicodeError."""

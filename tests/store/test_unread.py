@@ -83,6 +83,18 @@ async def all_read(harness: Harness) -> None:
             await asyncio.sleep(0.001)
 
 
+def fail(*_: object) -> object:
+    raise sqlite3.OperationalError("disk I/O error")
+
+
+def came_back(harness: Harness, name: str) -> Peer:
+    """A client whose queue is not read yet: nothing is waited for."""
+    client = harness.peer()
+    client.say_connect(name, **lasting(5))
+    client.client.accept(client.user)
+    return client
+
+
 def taken(client: Peer) -> list[bytes]:
     """What a client was sent, which it acknowledges."""
     got = []
@@ -137,9 +149,7 @@ async def test_what_comes_meanwhile_is_behind_them_and_all_is_delivered(
 ) -> None:
     harness = start()
     publisher = await harness.join("publisher")
-    client = harness.peer()
-    client.say_connect("two", **lasting(5))
-    client.client.accept(client.user)
+    client = came_back(harness, "two")
     publisher.send(Publish("two/x", b"new", 1, packet_id=1))
     harness.broker.flush()
     got = []
@@ -348,9 +358,6 @@ async def test_what_cannot_be_read_is_left_for_the_next_start(
 ) -> None:
     harness = start()
 
-    def fail(*_: object) -> object:
-        raise sqlite3.OperationalError("disk I/O error")
-
     with monkeypatch.context() as context:
         context.setattr(unread.UnreadQueues, "_execute", fail)
         publisher = await harness.join("publisher")
@@ -494,9 +501,7 @@ async def test_newer_messages_of_a_group_are_passed_on_too(start: Callable[..., 
 
 async def test_what_a_turn_sends_leaves_with_it(start: Callable[..., Harness]) -> None:
     harness = start()
-    client = harness.peer()
-    client.say_connect("one", **lasting(5))
-    client.client.accept(client.user)
+    came_back(harness, "one")
     harness.broker.flush()
     queues = harness.store._unread
     assert queues is not None
@@ -576,9 +581,6 @@ async def test_what_could_not_be_read_ends_with_its_session(
 ) -> None:
     harness = start()
 
-    def fail(*_: object) -> object:
-        raise sqlite3.OperationalError("disk I/O error")
-
     with monkeypatch.context() as context:
         context.setattr(unread.UnreadQueues, "_execute", fail)
         await all_read(harness)
@@ -595,9 +597,7 @@ async def test_publishers_wait_for_a_queue_that_is_being_read(
     monkeypatch.setattr(unread, "MESSAGES_A_TURN", 1)
     harness = start(Limits(queue_messages=COUNT + 50, user=ALONE))
     session = harness.broker.sessions["one"]
-    client = harness.peer()
-    client.say_connect("one", **lasting(5))
-    client.client.accept(client.user)
+    came_back(harness, "one")
     assert session.congestion is not None
     session.queue.clear()
     session.inflight.clear()
@@ -612,9 +612,7 @@ async def test_a_queue_with_a_gap_is_as_crowded_as_one_in_memory(
     monkeypatch.setattr(unread, "MESSAGES_A_TURN", 1)
     harness = start(Limits(queue_messages=2 * COUNT + 10, user=ALONE))
     session = harness.broker.sessions["one"]
-    client = harness.peer()
-    client.say_connect("one", **lasting(5))
-    client.client.accept(client.user)
+    came_back(harness, "one")
     assert session.congestion is None
     inside = harness.broker.attach("_inside", InsideLink())
     for _ in range(10):
