@@ -171,6 +171,18 @@ def escaped() -> Iterator[list[str]]:
     assert not handler.told, "\n".join(handler.told)
 
 
+@pytest.fixture
+def no_collection() -> Iterator[None]:
+    """No garbage is collected, for tests of what reaches the recursion limit.
+
+    Python may do that at any depth; there, finalizers of what earlier tests left behind fail, and
+    pytest counts that for a failure of this one.
+    """
+    gc.disable()
+    yield
+    gc.enable()
+
+
 @pytest.fixture(scope="session")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ApplianceProcess]:
     """A running appliance for all tests that change nothing about it."""

@@ -144,6 +144,7 @@ def first(value: object, at: int) -> Callable[[dict[str, Any]], object]:
     return replace
 
 
+@pytest.mark.usefixtures("no_collection")
 @pytest.mark.parametrize(
     "harm",
     [

@@ -20,7 +20,18 @@ import pytest
 from waiting import PATIENCE
 
 from appliance import bench
-from appliance.bench import cells, client, command, conversion, drain, ends, growth, load, report
+from appliance.bench import (
+    cells,
+    client,
+    command,
+    conversion,
+    drain,
+    ends,
+    growth,
+    load,
+    peers,
+    report,
+)
 from appliance.bench.cells import (
     CELLS,
     BridgeCell,
@@ -84,6 +95,33 @@ def test_every_load_gives_sane_figures_on_both_brokers(cell: Cell) -> None:
             assert figures.beside_us is not None
         check_sane(figures)
     assert row.met is not None
+
+
+@pytest.mark.timed
+@needs_mosquitto
+def test_a_time_without_a_delivery_is_measured_until_there_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = Site(tmp_path)
+    site.prepare()
+    with peers.mosquitto(PEERS[0], site) as server:
+        (broker,) = map(psutil.Process, server.pids)
+        pauses = [0.5, 1.5]
+
+        def stand_still(run: load.LoadRun) -> None:
+            broker.suspend()
+            run.serve(time.perf_counter() + 0.2)  # what the broker has sent already
+            run.flows[0].latencies = []
+            threading.Timer(pauses.pop(0), broker.resume).start()
+
+        monkeypatch.setattr(load.LoadRun, "reset_latencies", stand_still)
+        result = load.run_messages("qos0-pair", server.target(tls=False), Load(), 0.1, spin=False)
+        check_sane(result)
+        assert 0.4 < result.seconds < 3
+
+        monkeypatch.setattr(load, "STALL_SECONDS", 0.5)
+        with pytest.raises(LoadError, match="nothing was delivered while measuring"):
+            load.run_messages("qos0-pair", server.target(tls=False), Load(), 0.1, spin=False)
 
 
 @needs_mosquitto

@@ -196,6 +196,7 @@ async def test_a_flood_of_lines_waits(monkeypatch: pytest.MonkeyPatch) -> None:
         assert heard == 1
 
 
+@pytest.mark.usefixtures("no_collection")
 @pytest.mark.parametrize(
     "line",
     [

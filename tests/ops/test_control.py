@@ -49,6 +49,7 @@ async def test_what_cannot_be_done_is_told(path):
     assert await asyncio.to_thread(ask, path, "answer") == {"n": 1}
 
 
+@pytest.mark.usefixtures("no_collection")
 @pytest.mark.parametrize(
     "request_line",
     [
