@@ -993,6 +993,7 @@ ELSEWHERE = {
 PARTS = 2
 
 
+@pytest.mark.patches
 @pytest.mark.timeout(900)
 @pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
 @pytest.mark.parametrize("part", range(PARTS))
@@ -1176,6 +1177,7 @@ def test_who_could_not_be_let_in_is_cut_off(
     escaped.clear()
 
 
+@pytest.mark.patches
 async def test_who_a_fault_arose_with_is_told_at_once(
     tmp_path: Path, escaped: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sized
+from collections.abc import Sized
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -28,6 +28,17 @@ class CongestedReader(Protocol):
     @property
     def awaits_store(self) -> bool:
         """Whether it can be sent nothing until the store has read on."""
+
+
+class Clock(Protocol):
+    """Seconds, from any beginning.
+
+    Not a Callable: mypy would add a field of that type to derived dataclasses once more, and the
+    garbage collector would see it twice in compiled ones, which then are never freed.
+    """
+
+    def __call__(self) -> float:
+        """The time now."""
 
 
 @dataclass(slots=True)
@@ -67,7 +78,7 @@ class Accounting:
     failing: bool = False
     #: A clock, in seconds, that stops while the clients could do nothing because the broker was
     #: busy or the computer was loaded.
-    client_time: Callable[[], float] = field(init=False)
+    client_time: Clock = field(init=False)
 
     def __post_init__(self) -> None:
         self.client_time = lambda: self.now

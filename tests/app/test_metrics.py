@@ -162,6 +162,7 @@ async def test_hashing_does_not_hold_up_the_loop(web: WebApp, monkeypatch: pytes
     assert (await asking)[0] == 401  # what `run` returns is no hash
 
 
+@pytest.mark.patches
 async def test_the_answer_of_a_plugin_is_waited_for(web: WebApp, monkeypatch: pytest.MonkeyPatch):
     router = web.app.broker.router
     decisions = [Decision(False, "", pending=True), Decision(True, "")]

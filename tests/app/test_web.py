@@ -46,6 +46,7 @@ async def test_it_is_well(web: WebApp, monkeypatch: pytest.MonkeyPatch):
     assert web.app._pulse.is_alive()
 
 
+@pytest.mark.patches
 async def test_it_is_not_well(web: WebApp, monkeypatch: pytest.MonkeyPatch):
     """As the watchdog: what counts is work that is done, not that the loop answers."""
     pulse, scheduler = web.app._pulse, web.app._listeners.scheduler

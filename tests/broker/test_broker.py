@@ -5,10 +5,13 @@ Statements of the standards are named as `[MQTT-…]`, those of 5.0 with `v5` wh
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 
 from appliance.broker.broker import Broker
 from appliance.broker.limits import Limits
+from appliance.broker.link import InsideLink
 from appliance.broker.message import Message
 from appliance.broker.values import Action, Identity
 from appliance.mqtt.codec import Property
@@ -1351,3 +1354,21 @@ def test_what_is_retained_meanwhile_is_what_is_sent(join: Join, broker: Broker):
     assert [m.payload for m in messages if m.topic == rest[1]] == [b""]
     assert {m.topic for m in messages} == set(rest)
     assert len(broker.retained) == 29
+
+
+# --- memory
+
+
+def test_a_broker_that_nobody_uses_any_more_is_freed():
+    """What refers to each other in circles is found by the garbage collector, compiled as well."""
+
+    def brokers() -> int:
+        gc.collect()
+        return sum(type(each) is Broker for each in gc.get_objects())
+
+    before = brokers()
+    broker = Broker(FakeAccess(), FakeStore())
+    broker.attach("inside", InsideLink())
+    assert brokers() == before + 1
+    del broker
+    assert brokers() <= before

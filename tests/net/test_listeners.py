@@ -412,6 +412,7 @@ async def overwhelm(harness: Harness, receive_buffer: int) -> Peer:
     return deaf
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("why", ["wrong bytes", "a fault"])
 async def test_who_does_not_read_the_last_bytes_is_cut_off(
     harness: Harness, monkeypatch, escaped, why
@@ -467,6 +468,7 @@ async def test_stop_during_a_login(harness: Harness):
     assert not harness.broker.sessions
 
 
+@pytest.mark.patches
 @pytest.mark.parametrize("is_decided", [False, True])
 async def test_a_user_who_is_removed_during_the_login(harness: Harness, monkeypatch, is_decided):
     """Its connection is not in a session yet, and was decided by what is no longer so."""
@@ -787,6 +789,7 @@ async def test_connections_from_one_address(harness: Harness, caplog):
     assert not await _is_refused(harness)
 
 
+@pytest.mark.patches
 async def test_a_fault_before_a_commit_leaves_no_guest_for_ever(harness: Harness, escaped):
     """The last bytes are written at the commit, when the fault is long over; or not at all."""
     await harness.start(connections_per_address=2)

@@ -320,6 +320,7 @@ async def test_who_streams_on_is_new_again_after_a_pause(harness):
         streaming.cancel()
 
 
+@pytest.mark.patches
 async def test_what_answers_connack_is_new_however_long_the_login_took(harness, monkeypatch):
     """The client is faster than the rest of what the broker does when it has answered."""
     answer_connect = ClientConnection._answer_connect

@@ -24,13 +24,15 @@ from appliance_process import ApplianceProcess
 from raw_client import RawClient
 from waiting import PATIENCE, eventually
 
-from appliance.broker.session import Session
+from appliance.broker.limits import Limits
+from appliance.broker.session import Session, SessionAccounting
 from appliance.broker.values import Action, Identity, TlsInfo
 from appliance.cli import main as cli
 from appliance.mqtt.packets import Connack, Disconnect, Publish, Subscribe, Subscription
 from appliance.mqtt.reason import ReasonCode
 from appliance.ops import audit as audit_module
 from appliance.ops.audit import Audit, AuditError, note
+from appliance.store.memory import MemoryStore
 
 WRONG = "a wrong password, never to be seen"
 
@@ -42,10 +44,8 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def session_of(user: str | None, client_id: str) -> Session:
-    session = Session.__new__(Session)
-    session.client_id = client_id
-    session.identity = Identity(user, client_id)
-    return session
+    accounting = SessionAccounting(Limits(), MemoryStore())
+    return Session(client_id, Identity(user, client_id), accounting)
 
 
 def entries(*paths: Path) -> list[dict[str, Any]]:

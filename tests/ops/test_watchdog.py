@@ -85,6 +85,7 @@ async def test_and_under_load(harness: Harness, pulse: Pulse, clock: Time):
     assert pulse.is_alive()
 
 
+@pytest.mark.patches
 async def test_not_when_no_turn_comes(harness: Harness, pulse: Pulse, clock: Time, caplog):
     pulse.is_alive()
     assert await lives(pulse)
@@ -111,6 +112,7 @@ async def test_not_when_the_clock_stands_still(pulse: Pulse, clock: Time, caplog
     assert await lives(pulse)
 
 
+@pytest.mark.patches
 async def test_a_turn_that_fails_is_no_sign_of_life(
     harness: Harness, pulse: Pulse, clock: Time, monkeypatch: pytest.MonkeyPatch, escaped
 ):

@@ -528,6 +528,7 @@ async def test_a_removed_route_is_not_told_of_behind_its_cleanup(
     assert [*told(there)] == ["binary_sensor/r2d2/x"]
 
 
+@pytest.mark.patches
 async def test_what_could_not_be_retained_is_told_again(
     there: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

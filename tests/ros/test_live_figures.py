@@ -87,6 +87,7 @@ async def test_nobody_looks(harness: Harness) -> None:
     assert len(told(harness.client)) == before
 
 
+@pytest.mark.patches
 async def test_who_may_not_read_does_not_start_them(harness: Harness, monkeypatch) -> None:
     harness.start(to_mqtt("/chatter"))
     harness.node.add_publisher("/chatter", STRING)
