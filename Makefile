@@ -1,6 +1,7 @@
 # make run   this computer becomes a robot's MQTT endpoint, with a demo robot   make run PORT=9883 PLAIN_PORT=9884 WEB_PORT=9443
 # make test  every check: format, lint, types, import directions, tests
 # make test-kilted  of these the tests that tell most about a distribution of ROS 2, on Kilted in place of Jazzy
+# make test-compiled  the tests with the broker as machine code: half an hour
 # make compiled  a wheel in dist/ with the broker as machine code, for this Python and this kind of
 #                computer; needs a C compiler and Python's headers (apt install gcc python3-dev)
 # make binary    dist/appliance: one executable with everything in it, for this kind of computer;
@@ -35,7 +36,7 @@ TEST_EXTRAS := [ros,test]
 BINARY_EXTRAS := [ros,binary]
 endif
 
-.PHONY: run test test-kilted checks tests-imported compiled binary deb release
+.PHONY: run test test-kilted test-compiled checks tests-imported compiled binary deb release
 run: .venv/run.stamp
 	@$(BIN)/appliance init --demo --dir run
 	@APPLIANCE_PORT=$(PORT) APPLIANCE_PLAIN_PORT=$(PLAIN_PORT) APPLIANCE_WEB_PORT=$(WEB_PORT) \
@@ -60,6 +61,11 @@ checks: .venv/test.stamp
 # again in the test run, which says why.
 tests-imported: .venv/test.stamp
 	@$(BIN)/pytest --collect-only -qq >/dev/null 2>&1 || true
+
+# All but what builds, measures, or asks other Pythons: with machine code, as it is released.
+test-compiled: .venv/test.stamp build/compiled $(INTEROP)/node_modules
+	PYTHONPATH=$(CURDIR)/build/compiled $(BIN)/pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder \
+	  -m 'not timed and not patches' $(addprefix --ignore=tests/,arm64 bench container packaging test_oldest_python.py)
 
 test-kilted: $(KILTED)/test.stamp
 	$(KILTED)/bin/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m 'not timed' $(KILTED_TESTS)

@@ -41,6 +41,7 @@ __all__ = ["isolated_domain"]
 NOT_RUN = {
     "make test": "runs all tests, of which this is one",
     ".venv/bin/python -m pytest tests/broker -q -x": "runs tests, which `make test` does as well",
+    "make test-compiled": "compiles, and runs tests for half an hour; some are in `make test`",
     "make compiled": "compiles for minutes; tests/packaging/test_compiled.py does the same",
     "appliance clients kick tablet --user alice --host robot.local --ca ca.crt": "needs another"
     " client; tests/cli/test_clients.py disconnects one",

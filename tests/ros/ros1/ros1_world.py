@@ -47,6 +47,7 @@ Run = Callable[..., "tuple[int, str]"]
 
 HERE = Path(__file__).parent
 ROOT = Path(appliance.__file__).parent.parent
+PROJECT = Path(__file__).parents[3]
 
 
 def is_installed() -> bool:
@@ -70,7 +71,7 @@ class Python:
         subprocess.run([SYSTEM_PYTHON, "-m", "venv", "--system-site-packages", home], check=True)
         self.executable = str(home / "bin/python")
         pip = [self.executable, "-m", "pip", "install", "-q", "--use-pep517"]
-        subprocess.run([*pip, "-c", ROOT / "constraints.txt", ROOT], check=True)
+        subprocess.run([*pip, "-c", PROJECT / "constraints.txt", PROJECT], check=True)
 
 
 def link_packages(folder: Path) -> None:
@@ -80,7 +81,7 @@ def link_packages(folder: Path) -> None:
         if file.parts[0].endswith(".dist-info"):  # it tells its version
             link(own, file.parts[0], folder)
     # What was installed may be older than what is here.
-    todo = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    todo = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["dependencies"]
     done = set()
     while todo:
         requirement = Requirement(todo.pop())
