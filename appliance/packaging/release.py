@@ -138,7 +138,9 @@ class Release:
         made = self._work / f"one-file-{machine}"
         # The root and its Python are kept for the next release.
         cache = root.default_cache(machine)
-        options = ("--machine", machine, "--cache", cache, "--out", made)
+        options = ["--machine", machine, "--cache", str(cache), "--out", str(made)]
+        if not emulation.is_foreign(machine):  # emulated, the profile alone would take hours
+            options.append("--optimized")
         self._run(sys.executable, "-m", "appliance.packaging.root", *options, cwd=self._source)
         if (cache / root.OUTDATED).exists():
             self._say(f"without security updates of Debian's {root.SUITE}: the mirror has none")

@@ -427,7 +427,7 @@ def main() -> int:
     parser.add_argument(
         "--optimized",
         action="store_true",
-        help="build Python with PGO and LTO, which takes an hour",
+        help="build Python with PGO and LTO, which takes half an hour more",
     )
     options = parser.parse_args()
     os.umask(0o022)
