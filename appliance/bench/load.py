@@ -46,6 +46,7 @@ STALL_SECONDS = 3.0  # without a delivery: the broker has lost messages, or has 
 RUN_SECONDS = 3.0  # of a run, unless said otherwise
 DRAIN_SECONDS = 2.0  # for messages in flight after the last was sent
 WARM_UP_SECONDS = 0.3
+LOOK_SECONDS = 0.1  # between two looks whether anything was delivered
 PROBE_SECONDS = 0.002  # between two round trips of the probe beside a flood
 CPUCLOCK_SCHED = 2  # clock_getcpuclockid(3): nanoseconds of all threads of a process
 
@@ -237,7 +238,7 @@ class LoadRun:
         while self.deliveries == deliveries:
             if time.perf_counter() > until:
                 raise LoadError("nothing was delivered while measuring")
-            self.serve(time.perf_counter() + WARM_UP_SECONDS)
+            self.serve(time.perf_counter() + LOOK_SECONDS)
 
     @property
     def deliveries(self) -> int:
