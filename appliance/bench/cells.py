@@ -344,9 +344,10 @@ def ros_environment(number: int) -> dict[str, str]:
 
 def image_environment(number: int) -> dict[str, str]:
     """The same, with a profile that passes images through shared memory, for senders too."""
-    profile = str(fastdds.PROFILE)
-    names = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-    return {**ros_environment(number), **dict.fromkeys(names, profile)}
+    return {
+        **ros_environment(number),
+        **dict.fromkeys(fastdds.VARIABLES, str(fastdds.file_of("default"))),
+    }
 
 
 def run_measuring(

@@ -13,7 +13,7 @@ from pathlib import Path
 from ros2_harness import BYTES, Harness, Peer, route
 from waiting import until
 
-from appliance.ros.ros2 import node as ros2
+from appliance.ros.ros2 import fastdds
 
 IMAGES = 50
 
@@ -38,7 +38,7 @@ async def main() -> None:
         await until(lambda: harness.bridged(), "the node")
         assert max(segments(), default=0) > 4 << 20, segments()
         profile = {name: os.environ[name] for name in os.environ if "DEFAULT_PROFILES" in name}
-        assert [Path(file).parent for file in profile.values()] == [Path(ros2.__file__).parent]
+        assert list(profile.values()) == [str(fastdds.file_of("default"))]
         peer = await Peer().start("camera", **profile)
         try:
             await both_ways(harness, peer)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from namespaces import has_namespaces
 from ros_domain import DOMAIN
 from waiting import until
 
@@ -128,26 +129,6 @@ def test_what_kilted_does_not_know_makes_nothing_local(monkeypatch):
 def test_only_enforced_security_is_security(enable, strategy, secured):
     environment = {"ROS_SECURITY_ENABLE": enable, "ROS_SECURITY_STRATEGY": strategy}
     assert discovery.is_secured(environment) is secured
-
-
-def has_namespaces():
-    try:
-        trial = [
-            "unshare",
-            "-n",
-            "ip",
-            "link",
-            "add",
-            "veth1",
-            "type",
-            "veth",
-            "peer",
-            "name",
-            "veth2",
-        ]
-        return subprocess.run(trial, capture_output=True).returncode == 0
-    except OSError:
-        return False
 
 
 def test_another_computer_of_the_network():

@@ -563,10 +563,14 @@ def test_fast_dds_2_has_a_variable_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     (tmp_path / "share" / "fastrtps").mkdir(parents=True)
     environment = {"ROS_LOCALHOST_ONLY": "1"}
-    assert not fastdds.use_profile(environment)
-    environment["ROS_LOCALHOST_ONLY"] = "0"
     assert fastdds.use_profile(environment)
-    assert Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
+    text = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "<nackSupressionDuration>" in text
+    assert "ransport" not in text  # or it would override the variable
+    environment = {"ROS_LOCALHOST_ONLY": "0"}
+    assert fastdds.use_profile(environment)
+    text = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert "<segment_size>4194304</segment_size>" in text
 
 
 def test_a_profile_in_the_working_directory_takes_precedence(tmp_path, monkeypatch):
@@ -574,6 +578,7 @@ def test_a_profile_in_the_working_directory_takes_precedence(tmp_path, monkeypat
     environment = {}
     assert fastdds.use_profile(environment)
     assert [Path(value).is_file() for value in environment.values()] == [True]
+    assert fastdds.use_profile(again := {}) and again == environment  # no second file
     Path("DEFAULT_FASTDDS_PROFILES.xml").touch()
     assert not fastdds.use_profile({})
 
@@ -581,7 +586,10 @@ def test_a_profile_in_the_working_directory_takes_precedence(tmp_path, monkeypat
 def test_an_old_fast_dds_gets_udp_by_a_profile(tmp_path, monkeypatch):
     environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
     monkeypatch.setattr(fastdds, "shares", lambda: [tmp_path])
-    assert not fastdds.use_profile(environment)
+    assert fastdds.use_profile(environment)
+    profile = Path(environment.pop("FASTDDS_DEFAULT_PROFILES_FILE")).read_text()
+    assert "<nack_supression_duration>" in profile
+    assert "ransport" not in profile  # a new one knows the variable
     (tmp_path / "fastrtps").mkdir()
     assert fastdds.use_profile(environment)
     profile = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()

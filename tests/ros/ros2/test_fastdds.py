@@ -1,0 +1,104 @@
+"""The profiles of Fast DDS, with the one that is installed."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from lose_last import TIMES
+from namespaces import has_namespaces
+from publish_fast import MESSAGES
+from ros_domain import DOMAIN
+
+from appliance.host.environment import for_other_programs
+from appliance.ros.ros2 import fastdds
+
+EMPTY = '<dds xmlns="http://www.eprosima.com"><profiles/></dds>'
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"ROS_LOCALHOST_ONLY": "1"},
+        {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
+        {"IS_LOCAL": "1"},
+        {"IS_LOCAL": "1", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"},
+    ],
+    ids=["default", "localhost only", "udp", "local", "local udp"],
+)
+def test_a_message_wakes_no_thread_for_timers(given):
+    wakeups, said = published(given)
+    assert wakeups < MESSAGES / 10
+    assert "XMLPARSER" not in said
+
+
+def test_without_the_profile_each_message_wakes_one(tmp_path):
+    profile = tmp_path / "mine.xml"
+    profile.write_text(EMPTY)
+    wakeups, _ = published(dict.fromkeys(fastdds.VARIABLES, str(profile)))
+    assert wakeups > MESSAGES / 10
+
+
+def test_both_versions_of_a_profile_say_the_same():
+    folder = fastdds.file_of("default").parent
+    new = {
+        "heartbeatPeriod": "heartbeat_period",
+        "nackSupressionDuration": "nack_supression_duration",
+    }
+    for file in folder.glob("*_3.xml"):
+        old = file.with_name(file.name.replace("_3", "_2")).read_text()
+        for name in new:
+            old = re.sub(rf"\b{name}\b", new[name], old)
+        assert old.replace("Fast DDS 2", "Fast DDS 3") == file.read_text()
+    assert len(list(folder.iterdir())) == 9  # Fast DDS 3 needs no profile for UDP
+
+
+def test_a_lost_message_is_repeated_soon_though_none_follows():
+    """With Fast DDS's own times it came after 0.5 to 2.6 s: for so long a robot had driven on."""
+    if not has_namespaces():
+        pytest.skip("needs root, iproute2 and network namespaces, for a network that loses")
+    network = ("unshare", "-n", "sh", "-c", 'ip link set lo up && exec "$0" "$@"')
+    given = {
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+        # LOCALHOST would add shared memory; the network is a loopback alone anyway.
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+    }
+    said = run("lose_last.py", given, *network)
+    waits = [float(wait) for wait in re.findall(r"came after (\S+)", said)]
+    assert len(waits) == TIMES
+    assert min(waits) > 0.05, "none was lost"
+    assert sorted(waits)[TIMES // 2] < 0.4, waits
+
+
+def published(given: dict[str, str]) -> tuple[int, str]:
+    """How often a thread for timers was woken, and all that was said."""
+    said = run("publish_fast.py", given)
+    found = re.search(r"woken (\d+)", said)
+    assert found, said
+    return int(found[1]), said
+
+
+def run(program: str, given: dict[str, str], *within: str) -> str:
+    """All that the program says, in a process of its own."""
+    pytest.importorskip("rclpy")
+    environment = {
+        **for_other_programs(),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": DOMAIN,
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        **given,
+    }
+    done = subprocess.run(
+        [*within, sys.executable, str(Path(__file__).parent / program), "publish"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
