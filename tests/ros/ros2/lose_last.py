@@ -11,7 +11,7 @@ import sys
 import time
 from typing import Any
 
-from publish_fast import PATIENCE, chosen_anew
+from publish_fast import chosen_anew, wait_for_subscriber
 
 from appliance.ros.ros2 import fastdds
 
@@ -35,11 +35,7 @@ def main() -> None:
     )
     assert listener.stdout is not None
     try:
-        deadline = time.monotonic() + PATIENCE
-        while not publisher.get_subscription_count():
-            assert time.monotonic() < deadline, "no subscriber"
-            time.sleep(0.01)
-        time.sleep(1)  # both have found each other
+        wait_for_subscriber(publisher)
         for _ in range(TIMES):
             set_loopback("down")
             publisher.publish(String(data=str(time.time())))

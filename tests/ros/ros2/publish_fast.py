@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from appliance.ros.ros2 import discovery, fastdds
 
@@ -36,11 +37,7 @@ def main() -> None:
     publisher = node.create_publisher(String, "/fast", 10)
     listener = subprocess.Popen([sys.executable, __file__], env=chosen_anew())
     try:
-        deadline = time.monotonic() + PATIENCE
-        while not publisher.get_subscription_count():
-            assert time.monotonic() < deadline, "no subscriber"
-            time.sleep(0.01)
-        time.sleep(0.5)  # both have found each other
+        wait_for_subscriber(publisher)
         before, began = wakeups(), time.monotonic()
         for number in range(MESSAGES):
             publisher.publish(String(data=str(number)))
@@ -48,6 +45,14 @@ def main() -> None:
     finally:
         listener.kill()
         listener.wait()
+
+
+def wait_for_subscriber(publisher: Any) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not publisher.get_subscription_count():
+        assert time.monotonic() < deadline, "no subscriber"
+        time.sleep(0.01)
+    time.sleep(1)  # both have found each other
 
 
 def chosen_anew() -> dict[str, str]:
