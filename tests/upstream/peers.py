@@ -489,9 +489,14 @@ class Ejabberd(Peer):
         }
 
     def command(self) -> list[str | Path]:
+        user, host, password = (f'<<"{name}">>' for name in (USER, "localhost", PASSWORD))
+        # After it was killed, it knows them only when their table is loaded.
         register = (
-            f'ejabberd_auth:try_register(<<"{USER}">>, <<"localhost">>, <<"{PASSWORD}">>),'
-            'io:format("the users are registered~n").'
+            f"Register = fun() -> ejabberd_auth:try_register({user}, {host}, {password}) end,"
+            f"Knows = fun() -> ejabberd_auth:check_password({user}, <<>>, {host}, {password}) end,"
+            "Pause = fun() -> timer:sleep(50) end,"
+            "Wait = fun Again() -> Register(), Knows() orelse begin Pause(), Again() end end,"
+            'Wait(), io:format("the users are registered~n").'
         )
         folder = f'"{self.directory}/spool"'
         start = ["-mnesia", "dir", folder, "-s", "ejabberd", "-eval", register]

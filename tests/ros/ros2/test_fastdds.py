@@ -17,6 +17,7 @@ from ros_domain import DOMAIN
 from appliance.host.environment import for_other_programs
 from appliance.ros.ros2 import fastdds
 
+SUPPRESSION = 0.004  # seconds, as in the profiles
 EMPTY = '<dds xmlns="http://www.eprosima.com"><profiles/></dds>'
 
 
@@ -32,16 +33,16 @@ EMPTY = '<dds xmlns="http://www.eprosima.com"><profiles/></dds>'
     ids=["default", "localhost only", "udp", "local", "local udp"],
 )
 def test_a_message_wakes_no_thread_for_timers(given):
-    wakeups, said = published(given)
-    assert wakeups < MESSAGES / 10
+    wakeups, seconds, said = published(given)
+    assert wakeups < 50 + 4 * seconds / SUPPRESSION
     assert "XMLPARSER" not in said
 
 
 def test_without_the_profile_each_message_wakes_one(tmp_path):
     profile = tmp_path / "mine.xml"
     profile.write_text(EMPTY)
-    wakeups, _ = published(dict.fromkeys(fastdds.VARIABLES, str(profile)))
-    assert wakeups > MESSAGES / 10
+    wakeups, _, _ = published(dict.fromkeys(fastdds.VARIABLES, str(profile)))
+    assert wakeups > MESSAGES / 2
 
 
 def test_both_versions_of_a_profile_say_the_same():
@@ -75,12 +76,12 @@ def test_a_lost_message_is_repeated_soon_though_none_follows():
     assert sorted(waits)[TIMES // 2] < 0.4, waits
 
 
-def published(given: dict[str, str]) -> tuple[int, str]:
-    """How often a thread for timers was woken, and all that was said."""
+def published(given: dict[str, str]) -> tuple[int, float, str]:
+    """How often a thread for timers was woken, in how many seconds, and all that was said."""
     said = run("publish_fast.py", given)
-    found = re.search(r"woken (\d+)", said)
+    found = re.search(r"woken (\d+) in (\S+)", said)
     assert found, said
-    return int(found[1]), said
+    return int(found[1]), float(found[2]), said
 
 
 def run(program: str, given: dict[str, str], *within: str) -> str:
