@@ -118,7 +118,9 @@ def check_compiler(machine: str) -> None:
 def unpack(sdist: Path, directory: Path) -> Path:
     """The folder of the sources, which is for one build: it leaves files behind for the next."""
     with tarfile.open(sdist) as archive:
-        archive.extractall(directory, filter="data")
+        # Python 3.11.2, Debian 12's, has no filters; the archive is our own.
+        archive.extraction_filter = getattr(tarfile, "data_filter", lambda member, _: member)
+        archive.extractall(directory)
     (source,) = directory.iterdir()
     return source
 

@@ -370,3 +370,16 @@ def test_what_the_workflow_runs_is_there() -> None:
     }
     assert with_identity == {"pypi": {"id-token": "write"}} and workflow["permissions"] == {}
     assert "secrets." not in WORKFLOW.read_text()
+
+
+@pytest.mark.parametrize("has_filters", [True, False], ids=["with filters", "as Debian 12's"])
+def test_an_archive_of_sources_is_unpacked(has_filters, tmp_path, monkeypatch):
+    """A release on Debian 12 had failed: its Python 3.11.2 knows no filters."""
+    if not has_filters:
+        monkeypatch.delattr(tarfile, "data_filter", raising=False)
+    (tmp_path / "appliance-1").mkdir()
+    (tmp_path / "appliance-1/setup.py").write_text("x = 1\n")
+    with tarfile.open(tmp_path / "sdist.tar.gz", "w:gz") as archive:
+        archive.add(tmp_path / "appliance-1", "appliance-1")
+    source = wheels.unpack(tmp_path / "sdist.tar.gz", tmp_path / "unpacked")
+    assert (source / "setup.py").read_text() == "x = 1\n"
