@@ -8,14 +8,18 @@ import sys
 from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
 
-#: The appliance's own profiles: `default` (the built-in transports with more shared memory), `udp`
-#: (that one alone); both for nodes of this computer only, `local` and `local_udp` (no socket is
-#: open to a network, and who is elsewhere and says to be here is not heard); and `writers`, which
-#: leaves transports as they are. Each is there for Fast DDS 2 and 3, which have different names
-#: for these times of reliable publishers (RTPS 2.3, 8.4.7.1):
+from appliance.ros.ros2 import installation
+
+#: The appliance's own profiles: `default` (the built-in transports with more shared memory) and
+#: `local` (for nodes of this computer only: no socket is open to a network, and who is elsewhere
+#: and says to be here is not heard); `udp` and `local_udp`, the same without shared memory;
+#: `writers`, which leaves transports as they are. All have these times of reliable publishers (RTPS
+#: 2.3, 8.4.7.1), which Fast DDS 2 and 3 name differently: neither reads a file for the other.
 #:
-#: - The heartbeat period, 100 ms: subscribers that have not acknowledged a message are told of it
-#:   again. Fast DDS's own is 3 s; for so long a stop is lost that the network has lost.
+#: - The heartbeat period, 500 ms: subscribers that have not acknowledged a message are told of it
+#:   again. Fast DDS's own is 3 s; for so long a stop is lost that the network has lost. With 100 ms
+#:   a link too narrow for its images had four times the packets, and each publisher of a subscriber
+#:   that hangs sent ten a second.
 #: - The NACK suppression, 4 ms: a request to repeat what was just sent is ignored, and subscribers
 #:   ask 5 ms after they have noticed. Fast DDS's own is 0, and then each message wakes a thread for
 #:   each subscriber, and waits for it: a third of what publishing 1,000 a second takes.
@@ -63,8 +67,13 @@ def shares() -> Iterator[Path]:
 
 
 def is_old() -> bool:
-    """Whether it is Fast RTPS, up to ROS 2 Jazzy. Fast DDS warns of the old variable."""
-    return any((share / "fastrtps").is_dir() for share in shares())
+    """Whether the Fast DDS of the ROS that is used is Fast RTPS (2), up to ROS 2 Jazzy."""
+    *sourced, own = shares()
+    # Another one may be sourced that this Python cannot use, or wheels be beside one that it can.
+    is_sourced = installation.find().source == "sourced"
+    found = (*sourced, own) if is_sourced else (own, *sourced)
+    names = (name for share in found for name in ("fastrtps", "fastdds") if (share / name).is_dir())
+    return next(names, "") == "fastrtps"
 
 
 def is_used(environment: Mapping[str, str]) -> bool:

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from lose_last import TIMES
@@ -15,7 +16,7 @@ from publish_fast import MESSAGES
 from ros_domain import DOMAIN
 
 from appliance.host.environment import for_other_programs
-from appliance.ros.ros2 import fastdds
+from appliance.ros.ros2 import fastdds, installation
 
 SUPPRESSION = 0.004  # seconds, as in the profiles
 EMPTY = '<dds xmlns="http://www.eprosima.com"><profiles/></dds>'
@@ -45,6 +46,38 @@ def test_without_the_profile_each_message_wakes_one(tmp_path):
     assert wakeups > MESSAGES / 2
 
 
+def test_the_times():
+    """500 ms: see fastdds.py. 4 ms: Fast DDS's subscribers ask after 5, and must not be ignored."""
+    for file in fastdds.file_of("default").parent.iterdir():
+        times = re.findall(r"<sec>(\d+)</sec><nanosec>(\d+)</nanosec>", file.read_text())
+        assert times == [("0", "500000000"), ("0", "4000000")]
+
+
+@pytest.mark.parametrize(
+    ("sourced", "own", "is_sourced", "is_old"),
+    [
+        ("fastdds", "fastrtps", True, False),  # Kilted, beside Jazzy's wheels
+        ("fastrtps", "fastdds", True, True),
+        ("fastrtps", "fastdds", False, False),  # of another Python, so that the wheels are used
+        ("fastdds", "fastrtps", False, True),
+        ("", "fastrtps", False, True),
+        ("fastdds", "", True, False),
+        ("", "", False, False),
+    ],
+)
+def test_the_version_is_that_of_the_ros_that_is_used(
+    sourced, own, is_sourced, is_old, tmp_path, monkeypatch
+):
+    """A profile for the other version is not read: the sockets would be open to the network."""
+    for where, name in (("sourced", sourced), ("own", own)):
+        (tmp_path / where / "share" / name).mkdir(parents=True)
+    found = SimpleNamespace(source="sourced" if is_sourced else "installed")
+    monkeypatch.setattr(installation, "find", lambda: found)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "own"))
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "sourced"))
+    assert fastdds.is_old() is is_old
+
+
 def test_both_versions_of_a_profile_say_the_same():
     folder = fastdds.file_of("default").parent
     new = {
@@ -60,7 +93,7 @@ def test_both_versions_of_a_profile_say_the_same():
 
 
 def test_a_lost_message_is_repeated_soon_though_none_follows():
-    """With Fast DDS's own times it came after 0.5 to 2.6 s: for so long a robot had driven on."""
+    """With Fast DDS's own times it came after 0.5 to 3.0 s: for so long a robot had driven on."""
     if not has_namespaces():
         pytest.skip("needs root, iproute2 and network namespaces, for a network that loses")
     network = ("unshare", "-n", "sh", "-c", 'ip link set lo up && exec "$0" "$@"')
@@ -73,7 +106,7 @@ def test_a_lost_message_is_repeated_soon_though_none_follows():
     waits = [float(wait) for wait in re.findall(r"came after (\S+)", said)]
     assert len(waits) == TIMES
     assert min(waits) > 0.05, "none was lost"
-    assert sorted(waits)[TIMES // 2] < 0.4, waits
+    assert sorted(waits)[TIMES // 2] < 0.9, waits
 
 
 def published(given: dict[str, str]) -> tuple[int, float, str]:

@@ -560,8 +560,8 @@ def test_the_users_settings_of_fast_dds_take_precedence(environment):
 
 
 def test_fast_dds_2_has_a_variable_of_its_own(tmp_path, monkeypatch):
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    (tmp_path / "share" / "fastrtps").mkdir(parents=True)
+    monkeypatch.setattr(fastdds, "shares", lambda: [tmp_path])
+    (tmp_path / "fastrtps").mkdir()
     environment = {"ROS_LOCALHOST_ONLY": "1"}
     assert fastdds.use_profile(environment)
     text = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
