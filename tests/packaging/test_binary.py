@@ -294,6 +294,20 @@ def test_programs_that_it_starts_run_in_it_too(box, bare_root):
     assert "appliance sub -c" in house.log
 
 
+def test_nobody_on_the_network_reaches_its_ros(box):
+    """With `discovery: localhost`, as `init` writes it: all sockets of DDS are on the loopback."""
+    house = box({"discovery": "localhost", "topics": [{"ros": "/odom", "to": "mqtt"}]})
+    house.wait_for_log("on ROS as")
+    process = psutil.Process(house.pid)
+    places = [
+        connection.laddr
+        for each in (process, *process.children(recursive=True))
+        for connection in each.net_connections("udp")
+    ]
+    # Those of groups are joined on the loopback alone.
+    assert {at.ip.partition(".")[0] for at in places} == {"127", "239"}
+
+
 async def test_types_without_compiled_support(box, bare_root, tmp_path):
     """A workspace that is built for another Python: its definitions are all that can be used."""
     built = build_workspace(tmp_path)

@@ -62,18 +62,30 @@ def file_of(kind: str) -> Path:
 
 def shares() -> Iterator[Path]:
     """The `share` folders of ROS's packages; that of the wheels is in the venv."""
-    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    yield from (Path(prefix, "share") for prefix in (*prefixes, sys.prefix))
+    yield from (prefix / "share" for prefix in _prefixes())
+
+
+def _prefixes() -> Iterator[Path]:
+    """Where ROS is sourced, and last where this Python is, which may have ROS's wheels."""
+    sourced = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    yield from map(Path, (*sourced, sys.prefix))
 
 
 def is_old() -> bool:
-    """Whether the Fast DDS of the ROS that is used is Fast RTPS (2), up to ROS 2 Jazzy."""
-    *sourced, own = shares()
+    """Whether the Fast DDS of the ROS that is used is Fast RTPS (2), up to ROS 2 Jazzy.
+
+    A wrong answer opens sockets to the network: a profile of the other version is not read.
+    """
+    *sourced, own = _prefixes()
     # Another one may be sourced that this Python cannot use, or wheels be beside one that it can.
     is_sourced = installation.find().source == "sourced"
-    found = (*sourced, own) if is_sourced else (own, *sourced)
-    names = (name for share in found for name in ("fastrtps", "fastdds") if (share / name).is_dir())
-    return next(names, "") == "fastrtps"
+    for prefix in (*sourced, own) if is_sourced else (own, *sourced):
+        for name in ("fastrtps", "fastdds"):
+            # The one file has of all this the library alone, beside itself.
+            for place in (f"share/{name}", f"lib/lib{name}.so*", f"lib{name}.so*"):
+                if next(prefix.glob(place), None) is not None:
+                    return name == "fastrtps"
+    return False
 
 
 def is_used(environment: Mapping[str, str]) -> bool:

@@ -78,6 +78,24 @@ def test_the_version_is_that_of_the_ros_that_is_used(
     assert fastdds.is_old() is is_old
 
 
+@pytest.mark.parametrize(
+    ("file", "is_old"),
+    [
+        ("libfastrtps.so.2.14", True),  # as in the one file
+        ("libfastdds.so.3.2", False),
+        ("lib/libfastrtps.so", True),
+        ("lib/libfastdds.so.3.2.2", False),
+    ],
+)
+def test_the_version_is_that_of_the_library(file, is_old, tmp_path, monkeypatch):
+    """The one file has no `share/fastrtps`: its sockets were open to the network."""
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).touch()
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    assert fastdds.is_old() is is_old
+
+
 def test_both_versions_of_a_profile_say_the_same():
     folder = fastdds.file_of("default").parent
     new = {

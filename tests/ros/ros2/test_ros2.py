@@ -560,8 +560,8 @@ def test_the_users_settings_of_fast_dds_take_precedence(environment):
 
 
 def test_fast_dds_2_has_a_variable_of_its_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(fastdds, "shares", lambda: [tmp_path])
-    (tmp_path / "fastrtps").mkdir()
+    monkeypatch.setattr(fastdds, "_prefixes", lambda: [tmp_path])
+    (tmp_path / "share/fastrtps").mkdir(parents=True)
     environment = {"ROS_LOCALHOST_ONLY": "1"}
     assert fastdds.use_profile(environment)
     text = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
@@ -585,12 +585,12 @@ def test_a_profile_in_the_working_directory_takes_precedence(tmp_path, monkeypat
 
 def test_an_old_fast_dds_gets_udp_by_a_profile(tmp_path, monkeypatch):
     environment = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-    monkeypatch.setattr(fastdds, "shares", lambda: [tmp_path])
+    monkeypatch.setattr(fastdds, "_prefixes", lambda: [tmp_path])
     assert fastdds.use_profile(environment)
     profile = Path(environment.pop("FASTDDS_DEFAULT_PROFILES_FILE")).read_text()
     assert "<nack_supression_duration>" in profile
     assert "ransport" not in profile  # a new one knows the variable
-    (tmp_path / "fastrtps").mkdir()
+    (tmp_path / "share/fastrtps").mkdir(parents=True)
     assert fastdds.use_profile(environment)
     profile = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
     assert "UDPv4" in profile and "SHM" not in profile
