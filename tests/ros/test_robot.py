@@ -294,7 +294,9 @@ def test_a_robot_that_is_driven_in_cbor(client_of, robot, appliance):
     accepted = call(f"{WALK}/_goal", {"order": 200})
     goal = accepted["goal_id"]
     other = call(f"{WALK}/_goal", {"order": 201})["goal_id"]
-    assert client.next(f"{WALK}/_feedback/{goal}")["sequence"][:1] == [0]  # the route's own: JSON
+    # The route's own: JSON. On a busy computer newer feedback takes the place of the first.
+    first, second, third = client.next(f"{WALK}/_feedback/{goal}")["sequence"]
+    assert first + second == third
     # What the goal's answer gave cancels that goal, and no other.
     assert call(f"{WALK}/_cancel", accepted) == {"goals_canceling": [goal]}
     assert client.next(f"{WALK}/_result/{goal}")["status"] == "canceled"
