@@ -295,8 +295,9 @@ def test_a_robot_that_is_driven_in_cbor(client_of, robot, appliance):
     goal = accepted["goal_id"]
     other = call(f"{WALK}/_goal", {"order": 201})["goal_id"]
     # The route's own: JSON. On a busy computer newer feedback takes the place of the first.
-    first, second, third = client.next(f"{WALK}/_feedback/{goal}")["sequence"]
-    assert first + second == third
+    steps = [0, 1, 1, 2, 3, 5, 8, 13, 21, 34]
+    feedback = client.next(f"{WALK}/_feedback/{goal}")["sequence"]
+    assert feedback in [steps[at : at + 3] for at in range(len(steps) - 2)]
     # What the goal's answer gave cancels that goal, and no other.
     assert call(f"{WALK}/_cancel", accepted) == {"goals_canceling": [goal]}
     assert client.next(f"{WALK}/_result/{goal}")["status"] == "canceled"
